@@ -21,7 +21,7 @@ class Room(NamedTuple):
 
 ROOMS: dict[str, Room] = {
     "core": Room(0, "frames, options, checks, numerics, separable filters"),
-    "runtime": Room(0, "atomic files, scratch folders, kept programs, allocator, optional packages, Ctrl-C"),
+    "runtime": Room(0, "atomic files, locks, scratch folders, kept programs, allocator, optional packages, Ctrl-C"),
     "data": Room(0, "nothing of its own: the rooms below"),
     "data.errors": Room(0, "the error of all files"),
     "color": Room(1, "tone curves, luminance"),

@@ -3,10 +3,11 @@
 import os
 import secrets
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from jaxdn.runtime.locks import try_lock
 
 
 @contextmanager
@@ -35,7 +36,7 @@ def _new_lock(parent: Path, prefix: str) -> tuple[Path, int]:
         lock = parent / f"{prefix}{secrets.token_hex(4)}.lock"
         handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_RDWR)
         # Another process may take it for abandoned before it is locked: it has the lock, or has removed the file.
-        if _try_lock(handle) is not False and lock.exists():
+        if try_lock(handle) is not False and lock.exists():
             return lock, handle
         os.close(handle)
         _remove(lock)
@@ -54,7 +55,7 @@ def remove_abandoned_folders(parent: Path, prefix: str) -> None:
         except OSError:
             continue
         try:
-            free = _try_lock(handle)
+            free = try_lock(handle)
             if free:
                 shutil.rmtree(parent / name, ignore_errors=True)
                 _remove(lock)  # while it is locked: once it is not, whoever has made it may lock it and go on
@@ -68,21 +69,3 @@ def _remove(lock: Path) -> None:
     """Remove a file; on Windows it stays while another process looks at it, and the next run removes it."""
     with suppress(OSError):
         lock.unlink()
-
-
-def _try_lock(handle: int) -> bool | None:
-    """Lock a file for as long as it is open in this process; False if another has locked it, None if nobody can."""
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):  # the second on Windows
-        return False
-    except OSError:  # the disk has no locks
-        return None
-    return True

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import Method
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.runtime.cores import count_cores
+from jaxdn.runtime.locks import lock_folder
 from jaxdn.training.devices import make_mesh
 from jaxdn.training.loop import InitialWeights, ResumableBatches, fit, read_resumed_from
 from jaxdn.training.processes import check_same, writes
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.weights import save_weights, starting_params
+
+_BUSY = "expected a folder in which no other process trains, one does; wait for its end, or take another --out."
 
 
 def train(
@@ -37,8 +41,8 @@ def train(
     """Train a method to the end, unless it is trained already, and return the path of its weights.
 
     The weights are the running mean that the recipe asks for. A second call resumes from the newest checkpoint in
-    ``out``. Raises ValueError for options that the method does not have, unsuitable clips, and a backend that cannot
-    run here.
+    ``out``. Raises ValueError for options that the method does not have, unsuitable clips, a backend that cannot run
+    here, and a folder in which another process trains.
 
     Args:
       method: a row of the table of methods.
@@ -77,18 +81,19 @@ def train(
     first = None
     if start is not None:
         first = InitialWeights(str(start), starting_params(start, denoiser, factory=method.name, options=options))
-    state = fit(
-        denoiser,
-        recipe,
-        batches,
-        out,
-        label=label,
-        start=first,
-        method={"method": method.name, "options": _list_options(method, options)},
-        validation=held_out,
-        time_limit=time_limit,
-        devices=devices,
-    )
+    with lock_folder(out, _BUSY) if writes() else nullcontext():
+        state = fit(
+            denoiser,
+            recipe,
+            batches,
+            out,
+            label=label,
+            start=first,
+            method={"method": method.name, "options": _list_options(method, options)},
+            validation=held_out,
+            time_limit=time_limit,
+            devices=devices,
+        )
     origin: dict[str, Any] = {} if first is None else {"start": first.name}
     if earlier := read_resumed_from(out):
         origin["begun_with"] = earlier

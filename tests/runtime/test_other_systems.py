@@ -13,7 +13,7 @@ import pytest
 
 import jaxdn
 from jaxdn.clips import write_exr
-from jaxdn.runtime import atomic_files, scratch
+from jaxdn.runtime import atomic_files, locks
 from jaxdn.runtime.atomic_files import remove_abandoned, write_atomically
 from jaxdn.runtime.scratch import scratch_folder
 from jaxdn.sequence.frame_denoiser import measure_machine_memory
@@ -116,7 +116,7 @@ def test_scratch_folders_are_locked_as_windows_locks(tmp_path: Path, monkeypatch
         held.add((about.st_dev, about.st_ino))
 
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=lock, LK_NBLCK=2))
-    monkeypatch.setattr(scratch, "sys", SimpleNamespace(platform="win32"))
+    monkeypatch.setattr(locks, "sys", SimpleNamespace(platform="win32"))
     left = tmp_path / ".backwards-dead.lock"
     left.touch()
     left.with_suffix("").mkdir()

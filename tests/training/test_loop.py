@@ -20,6 +20,7 @@ from jaxdn.recipes.augmentation import Augmentation
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.runtime.interrupt import Terminated
+from jaxdn.runtime.locks import LOCK, lock_folder
 from jaxdn.training import loop as loop
 from jaxdn.training.checkpoint import Checkpoints
 from jaxdn.training.log import Log, read_curve, read_log
@@ -104,6 +105,15 @@ def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_p
     with pytest.raises(ValueError, match=r"got option alpha 0.2 -> 0.5;"):  # these weights are offsets from 0.2
         train(method, recipe, clips, tmp_path, options={"levels": 1, "alpha": 0.5})
     assert before == (weights.read_bytes(), weights.with_suffix(".json").read_bytes())
+
+
+def test_a_folder_in_which_another_process_trains_is_refused(clips, tmp_path):
+    method = method_named("svgf")
+    recipe = method.recipe_named(None)._replace(steps=1, batch=2, crop=16, frames=3)
+    problem = r"a folder in which no other process trains, one does; .*--out"
+    with lock_folder(tmp_path, ""), pytest.raises(ValueError, match=problem):
+        train(method, recipe, clips, tmp_path, options={"levels": 1})
+    assert [path.name for path in tmp_path.iterdir()] == [LOCK]
 
 
 def test_another_recipe_in_the_same_folder_is_refused(clips, tmp_path):
