@@ -42,8 +42,10 @@ _WORK: dict[str, Work] = {}
 _here = threading.local()
 _calling: set[int] = set()
 """The threads that are in a call."""
-_QUIET = 20
-"""Milliseconds without a call, after which at the end of the process none is expected any more."""
+_PAUSE, _QUIET = 5e-3, 4
+"""Seconds between looks at what still runs as the process ends, and how many in a row have to find nothing."""
+_PATIENCE = 10.0
+"""Seconds that arrays are waited for: one that waits for another process, which has gone, is never computed."""
 
 
 def call_host(
@@ -225,21 +227,26 @@ def _end_with_process() -> None:
 
 
 def _finish() -> None:
-    """Wait for what the process still holds and for calls that have begun, and keep XLA's client for ever.
+    """Keep XLA's client for ever, and wait for calls that have begun and, for a while, for arrays.
 
     As a process ends, jax deletes the client, which waits for all programs and keeps Python's lock meanwhile: one that
     nobody has waited for, and that has a call to make, would never end. Those not yet begun end with the process.
     """
-    with contextlib.suppress(RuntimeError):  # there is no CPU among jax's platforms, or an array is an error
+    with contextlib.suppress(RuntimeError):  # there is no CPU among jax's platforms
         client = jax.local_devices(backend="cpu")[0].client
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
-    for array in jax.live_arrays():
-        with contextlib.suppress(RuntimeError):
-            array.block_until_ready()
-    quiet = _QUIET if not _calling else 0
+    end = time.monotonic() + _PATIENCE
+    quiet = 0 if _is_busy(end) else _QUIET
     while quiet < _QUIET:
-        time.sleep(1e-3)
-        quiet = 0 if _calling else quiet + 1
+        time.sleep(_PAUSE)
+        quiet = 0 if _is_busy(end) else quiet + 1
+
+
+def _is_busy(end: float) -> bool:
+    """Whether there are calls, or, until ``end`` by ``time.monotonic()``, arrays that are not computed yet."""
+    if _calling or time.monotonic() > end:
+        return bool(_calling)
+    return not all(array.is_ready() for array in jax.live_arrays())
 
 
 def _keep_thread() -> None:
