@@ -53,6 +53,8 @@ class Options:
     """Sample counts."""
     kinds: list[str] = field(default_factory=list)
     """Kinds of clips; default: all that are there."""
+    part: str = ""
+    """What of the test clips these are, such as "64 samples": it is added to the tables' titles and file names."""
     table: bool = False
     """Measure nothing: print the means of what has been measured."""
 
@@ -69,8 +71,9 @@ def main(options: Options) -> int:
     rows = read_rows(options.out, [clip.name for clip in clips])
     for spp in options.spp:
         print_table([row for row in rows if row["spp"] == spp and row["method"] in options.methods], spp)
+    part = "-" + options.part.replace(" ", "-") if options.part else ""
     for name, measurement in (("cycles-test", means), ("cycles-test-kinds", kinds)):
-        write_json(options.out / f"quality-{name}.json", measurement(rows, options))
+        write_json(options.out / f"quality-{name}{part}.json", measurement(rows, options))
     return 0
 
 
@@ -190,14 +193,11 @@ def means(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
         "`+no-safe` is `--no-safe`, `+prefiltered` is Open Image Denoise as Blender runs it by default, with guides "
         "that it denoises first. Open Image Denoise is that of the quality high. PSNR of x / (1 + x) in dB, without "
         "the references' noise. *Edges* are the tenth of the pixels whose guides differ most from their neighbours'. "
-        "*Temporal* is the PSNR of the change between two frames."
+        "*Temporal* is the PSNR of the change between two frames. "
+        f"Scored: frames {', '.join(map(str, sorted({number for row in rows for number in row['frames']})))}."
     )
-    return {
-        **_describe("Cycles test clips", 9, what, lines, options),
-        "columns": columns,
-        "group": "samples",
-        "readme": {},
-    }
+    described = {**_describe("Cycles test clips", 9, what, lines, options), "columns": columns, "group": "samples"}
+    return described if options.part else {**described, "readme": {}}
 
 
 def kinds(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
@@ -220,6 +220,9 @@ def kinds(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
 
 def _describe(title: str, order: float, what: str, rows: Sequence[Any], options: Options) -> dict[str, Any]:
     command = f"python -m experiments.cycles.compare {options.folder.name} --methods {' '.join(options.methods)}"
+    if options.part:
+        title, order = f"{title}, {options.part}", order + 0.3
+        command += f" --spp {' '.join(map(str, options.spp))} --part '{options.part}'"
     return describe_measurement("table", title, "Quality", order, command=command, what=what, rows=rows)
 
 

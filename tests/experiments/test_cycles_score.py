@@ -1,5 +1,6 @@
 """Scores of images against references of two halves: what is measured is free of the references' own noise."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -175,4 +176,13 @@ def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     assert by_kind == [["sun", 4, *(rows[m]["psnr"] for m in options.methods)]]
     page = results_page(list(results.values()))
     assert "1 clip of 1 kind" in page
+    assert "Scored: frames 2, 3." in page
     assert "| sun | 4 |" in page
+    assert compare.main(replace(options, part="few samples", methods=["noisy"], table=True)) == 0
+    results = {result["file"]: result for result in read_results(tmp_path / "out")}
+    assert len(results) == 4
+    part = results["quality-cycles-test-few-samples.json"]
+    assert part["title"] == "Cycles test clips, few samples"
+    assert part["command"].endswith("--methods noisy --spp 4 --part 'few samples'")
+    assert "readme" in results["quality-cycles-test.json"]
+    assert "readme" not in part
