@@ -42,6 +42,8 @@ from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import NOISY
 
+TRAINED_ON = ("bathroom", "kitchen", "living-room-2", "spaceship", "veach-ajar", "veach-lamp")
+"""Rooms that ``steady`` and ``ntd`` were trained on."""
 FIRST = "-0"
 """How the name of a clip ends whose noise is denoised."""
 
@@ -162,6 +164,11 @@ def table(rows: Sequence[Mapping[str, Any]], options: Options) -> dict[str, Any]
         "`--no-safe`. PSNR of x / (1 + x) in dB, without the references' noise; *edges* are the tenth of the pixels "
         "whose guides differ most from their neighbours'; *temporal* is the PSNR of the change between two frames."
     )
+    if known := [room for room in rooms if room in TRAINED_ON]:
+        what += (
+            f" `steady` and `ntd` were trained on {' and '.join(known)}; the training of `combiner`, on clips of Cycles "
+            "alone, began with weights of `steady`."
+        )
     command = f"python -m experiments.cycles.rooms {options.folder.name} --methods {' '.join(options.methods)}"
     described = describe_measurement(
         "table", "Rooms of our own renderer, all light", "Quality", 20, command=command, what=what, rows=lines

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.cycles import rooms
+from experiments.cycles.compare import FIGURES
 from experiments.results_page import read_results
 from jaxdn import clips
 from jaxdn.core.frame import Clip, Frame
@@ -76,3 +77,11 @@ def test_a_folder_without_rooms_and_clips_through_centres_are_refused(tmp_path: 
     clips.write_clip(Clip(plain), tmp_path / "hall-0")
     with pytest.raises(ValueError, match="filtered pixels and a reference"):
         rooms.read_references([tmp_path / "hall-0"])
+
+
+def test_the_table_names_the_rooms_that_were_trained_on() -> None:
+    figures = dict.fromkeys(FIGURES, 30.0)
+    rows = [{"clip": room, "kind": room, "spp": 4, "method": "noisy", **figures} for room in ("kitchen", "staircase2")]
+    options = rooms.Options(Path("rooms"), methods=["noisy"], spp=[4])
+    assert "trained on kitchen;" in rooms.table(rows, options)["what"]
+    assert "trained on" not in rooms.table(rows[1:], options)["what"]
