@@ -166,8 +166,8 @@ def table(rows: Sequence[Mapping[str, Any]], options: Options) -> dict[str, Any]
     )
     if known := [room for room in rooms if room in TRAINED_ON]:
         what += (
-            f" `steady` and `ntd` were trained on {' and '.join(known)}; the training of `combiner`, on clips of Cycles "
-            "alone, began with weights of `steady`."
+            f" `steady` and `ntd` were trained on {' and '.join(known)}; the training of `combiner`, on clips of "
+            "Cycles alone, began with weights of `steady`."
         )
     command = f"python -m experiments.cycles.rooms {options.folder.name} --methods {' '.join(options.methods)}"
     described = describe_measurement(
