@@ -87,7 +87,7 @@ def find_rooms(folder: Path, wanted: Sequence[str]) -> dict[str, list[Path]]:
     """Name of a room -> its clips, that of seed 0 first. Raises ValueError where there is none."""
     names = [clip.parent.name.removesuffix(FIRST) for clip in sorted(folder.glob(f"*{FIRST}/clip.json"))]
     found = {
-        name: sorted(clip.parent for clip in folder.glob(f"{name}-[0-9]*/clip.json"))
+        name: sorted(clip.parent for clip in folder.glob(f"{name}-*/clip.json") if _room_of(clip.parent) == name)
         for name in names
         if not wanted or name in wanted
     }
@@ -95,6 +95,11 @@ def find_rooms(folder: Path, wanted: Sequence[str]) -> dict[str, list[Path]]:
         rooms = ", ".join(wanted) or "any room"
         raise ValueError(f"{folder}: expected clips ROOM{FIRST} of {rooms}, found none; render some with --seeds 0.")
     return found
+
+
+def _room_of(clip: Path) -> str:
+    """The name without the seed: ``living-room-2-0`` is of the room living-room-2."""
+    return clip.name.rpartition("-")[0]
 
 
 def read_references(clips: Sequence[Path]) -> list[Reference]:

@@ -79,6 +79,14 @@ def test_a_folder_without_rooms_and_clips_through_centres_are_refused(tmp_path: 
         rooms.read_references([tmp_path / "hall-0"])
 
 
+def test_rooms_whose_names_begin_alike_are_two(tmp_path: Path) -> None:
+    for name in ("living-room-0", "living-room-2-0", "living-room-1"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "clip.json").write_text("{}")
+    found = {room: [clip.name for clip in clips] for room, clips in rooms.find_rooms(tmp_path, []).items()}
+    assert found == {"living-room": ["living-room-0", "living-room-1"], "living-room-2": ["living-room-2-0"]}
+
+
 def test_the_table_names_the_rooms_that_were_trained_on() -> None:
     figures = dict.fromkeys(FIGURES, 30.0)
     rows = [{"clip": room, "kind": room, "spp": 4, "method": "noisy", **figures} for room in ("kitchen", "staircase2")]
