@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import tyro
 
@@ -103,6 +104,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     write_json(target.with_suffix(".json"), {**row, "frames": pairs, **found.figures()})
     print(f"{clip.name} {spp} spp {method}: {found.figures()}", flush=True)
+    jax.clear_caches()  # programs of two hundred methods are more memory maps than Linux gives a process
 
 
 def denoise_frames(files: Sequence[Path], target: Path, method: str, scored: Sequence[int]) -> dict[int, np.ndarray]:

@@ -17,6 +17,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import tyro
 
@@ -141,6 +142,7 @@ def measure(room: str, clip: Path, held: Sequence[Reference], spp: int, method: 
     target.parent.mkdir(parents=True, exist_ok=True)
     write_json(target.with_suffix(".json"), {"clip": room, "kind": room, "spp": spp, "method": method, **found})
     print(f"{room} {spp} spp {method}: {found}", flush=True)
+    jax.clear_caches()  # as in experiments.cycles.compare
 
 
 def denoise_clip(clip: Path, frames: Sequence[Frame], spp: int, method: str, target: Path) -> list[np.ndarray]:

@@ -1,5 +1,6 @@
 """Scores of images against references of two halves: what is measured is free of the references' own noise."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -186,3 +187,15 @@ def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     assert part["command"].endswith("--methods noisy --spp 4 --part 'few samples'")
     assert "readme" in results["quality-cycles-test.json"]
     assert "readme" not in part
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="counts the memory maps that Linux lists")
+def test_programs_of_methods_that_are_done_are_let_go(tmp_path: Path) -> None:
+    """A process has 65,530 memory maps, and the program of a method takes hundreds."""
+    write_clip_of_cycles(tmp_path / "test" / "sun-9000", np.random.default_rng(6))
+    maps = []
+    for number in range(4):
+        compare.main(compare.Options(tmp_path / "test", tmp_path / str(number), ["svgf+no-safe"], [4]))
+        maps.append(len(Path("/proc/self/maps").read_text().splitlines()))
+    assert maps[-1] - maps[0] < 100
