@@ -62,7 +62,8 @@ def train(
     """
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
-    make_mesh(devices, recipe.batch)  # refused before clips are read
+    recipe.check()  # refused before clips are read and a folder is made, as is what follows
+    make_mesh(devices, recipe.batch)
     names = [place.name for place in clips]
     check_same(
         {"method": method.name, "options": dict(options), "devices": devices, "start": start, "clips": names}

@@ -107,6 +107,13 @@ def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_p
     assert before == (weights.read_bytes(), weights.with_suffix(".json").read_bytes())
 
 
+def test_an_impossible_recipe_makes_no_folder(clips, tmp_path):
+    method = method_named("svgf")
+    with pytest.raises(ValueError, match="learning_rate"):
+        train(method, method.recipe_named(None)._replace(learning_rate=-1.0), clips, tmp_path / "run", options={})
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_folder_in_which_another_process_trains_is_refused(clips, tmp_path):
     method = method_named("svgf")
     recipe = method.recipe_named(None)._replace(steps=1, batch=2, crop=16, frames=3)
