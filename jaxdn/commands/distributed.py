@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import jax
 
+from jaxdn.runtime.interrupt import Stopped
+
 LOST_EXIT_CODE = 1
 """Of a process whose others have gone: the same commands, given again, go on from the newest checkpoint."""
 _HEARTBEAT_S = 60
@@ -29,7 +31,7 @@ class Place(NamedTuple):
 
 @contextmanager
 def join_processes(place: Place) -> Iterator[None]:
-    """Join the processes of a run, and wait for the others at the end.
+    """Join the processes of a run, and wait for the others at the end, also where all have stopped at Ctrl-C.
 
     Where another process is lost, or does not come within five minutes, this one ends with a message and exit code 1,
     or is ended by jax with 134. An error of this process itself, as a damaged file or full memory, is raised, and the
@@ -64,6 +66,9 @@ def join_processes(place: Place) -> Iterator[None]:
         ) from error
     try:
         yield
+    except Stopped:  # all processes have; without the first, which is where they meet, jax would abort the others
+        _leave()
+        raise
     except jax.errors.JaxRuntimeError as error:
         if not _is_of_this_process(error):
             _end_alone(error)
@@ -74,6 +79,11 @@ def join_processes(place: Place) -> Iterator[None]:
             _end_alone(error)
         _end_soon(2 if isinstance(error, (ValueError, OSError, ModuleNotFoundError)) else 1)
         raise
+    _leave()
+
+
+def _leave() -> None:
+    """Wait until all processes leave."""
     try:
         jax.distributed.shutdown()
     except jax.errors.JaxRuntimeError as error:

@@ -17,7 +17,11 @@ TERMINATED_EXIT_CODE = 143
 _AGAIN_S = 0.05
 
 
-class Terminated(KeyboardInterrupt):
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C, where the work has stopped for it after the current piece."""
+
+
+class Terminated(Stopped):
     """SIGTERM, where it is handled as Ctrl-C is."""
 
 
@@ -47,9 +51,9 @@ class Interrupt:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not Python's own
 
     def raise_if_asked(self) -> None:
-        """Raise KeyboardInterrupt where the work stops, or Terminated if SIGTERM asked for it."""
+        """Raise Stopped where the work stops, or Terminated if SIGTERM asked for it."""
         if self.asked:
-            raise Terminated if self.terminated else KeyboardInterrupt
+            raise Terminated if self.terminated else Stopped
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.asked and number == signal.SIGINT:

@@ -70,8 +70,8 @@ def fit(
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
     A run that was started with fewer steps goes on to ``recipe.steps``, along the schedule of that many. On Ctrl-C, or
-    SIGTERM, the update is finished and saved before KeyboardInterrupt (:class:`jaxdn.runtime.interrupt.
-    Terminated`) is raised; at the time limit the state is returned. Of several processes (:mod:`jaxdn.training.
+    SIGTERM, the update is finished and saved before :class:`jaxdn.runtime.interrupt.Stopped` (a KeyboardInterrupt)
+    or ``Terminated`` is raised; at the time limit the state is returned. Of several processes (:mod:`jaxdn.training.
     processes`) all stop where one is asked to, and the first writes.
     Raises ValueError for impossible values in the recipe, and, with what to change, after many updates in a row that
     changed nothing.

@@ -267,22 +267,40 @@ def test_what_does_not_fit_together_is_refused(
     assert not (tmp_path / "run").exists()
 
 
-def run_joined(port: int, work: str) -> subprocess.CompletedProcess[str]:
-    """The one process of a run, which does some work."""
+def start_joined(port: int, work: str, *, processes: int = 1, process: int = 0) -> subprocess.Popen[str]:
+    """A process of a run, which does some work."""
     program = f"""
+import time
 import jax, jax.numpy as jnp
 from jaxdn.commands.distributed import Place, join_processes
 from jaxdn.commands.errors import plain_errors
+from jaxdn.runtime.interrupt import Stopped, Terminated, exit_on_interrupt
 
 def stop(value):
     raise KeyboardInterrupt
 
-with plain_errors(), join_processes(Place("localhost:{port}", 1, 0)):
+with exit_on_interrupt(), plain_errors(), join_processes(Place("localhost:{port}", {processes}, {process})):
     {work}
 """
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     run = [sys.executable, "-c", program]
-    return subprocess.run(run, capture_output=True, text=True, check=False, timeout=120, env=environment)
+    return subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def run_joined(port: int, work: str) -> subprocess.CompletedProcess[str]:
+    """The one process of a run."""
+    with start_joined(port, work) as process:
+        out, errors = process.communicate(timeout=120)
+        return subprocess.CompletedProcess([], process.returncode, out, errors)
+
+
+@pytest.mark.parametrize(("late", "stopped", "code"), [(1, "Stopped", 130), (0, "Terminated", 143)])
+def test_processes_that_stop_together_wait_for_the_last_to_leave(late: int, stopped: str, code: int) -> None:
+    port = free_port()
+    works = [f"time.sleep({3 * (index == late)}); raise {stopped}" for index in range(2)]
+    pair = [start_joined(port, work, processes=2, process=index) for index, work in enumerate(works)]
+    told = [process.communicate(timeout=120)[1] for process in pair]
+    assert [process.returncode for process in pair] == [code, code], told
 
 
 @pytest.mark.parametrize(
