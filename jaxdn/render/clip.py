@@ -17,7 +17,8 @@ from jaxdn.render.bad_samples import count_noted, note_bad_samples, remove_notes
 from jaxdn.render.buffers.geometry import View
 from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.render.resume import check_resumable, digest_scene_file
+from jaxdn.render.resume import check_resumable
+from jaxdn.render.scene_digest import digest_scene_file
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing.tracer import choose_tracer

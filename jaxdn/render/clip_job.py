@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from jaxdn.data.clip.folder import begun_record, frame_path, is_clip, read_record
 from jaxdn.render.open_scene import scene_from_record
-from jaxdn.render.resume import digest_scene_file, is_scene_edited
+from jaxdn.render.scene_digest import digest_scene_file, find_edited
 from jaxdn.render.settings import RenderSettings
 
 
@@ -40,14 +40,14 @@ def keep_variant(job: ClipJob) -> ClipJob:
 
 
 def is_finished(job: ClipJob) -> bool:
-    """Whether the clip exists with all its frames, the wanted settings and a scene file that nobody has edited since.
+    """Whether the clip exists with all its frames, the wanted settings and scene files that nobody has edited since.
 
     This needs no separate process.
     """
     if not is_clip(job.folder):
         return False
     record = read_record(job.folder)
-    if is_scene_edited(record, digest_scene_file(job.scene)):
+    if find_edited(record, digest_scene_file(job.scene)):
         return False
     wanted = {"scene": job.scene, "frames": job.frames, **job.settings.record()}
     # What a job leaves open was chosen when the clip was started.

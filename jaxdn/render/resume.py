@@ -1,32 +1,15 @@
 """Check that the frames that a folder already has were rendered with the settings that are wanted now."""
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jaxdn.data.errors import ClipError
+from jaxdn.render.scene_digest import SCENE_FILE, SCENE_PARTS, find_edited
 from jaxdn.render.settings import LATER_SETTINGS
 
-_SCENE_FILE = "scene_file_sha256"
-_FREE = ("frames", "cameras", "versions", "bad_samples", _SCENE_FILE)
+_FREE = ("frames", "cameras", "versions", "bad_samples", SCENE_FILE, SCENE_PARTS)
 """Entries of a record that may change when rendering is resumed, or that are compared in a way of their own."""
-
-
-def digest_scene_file(scene: Mapping[str, Any]) -> dict[str, str]:
-    """The entry of a clip's record that tells the bytes of its scene file; none for a scene that has no file.
-
-    ``scene`` is the record of the scene. Files that the scene file includes are not read.
-    """
-    file = scene.get("file")
-    if file is None or not Path(file).is_file():
-        return {}
-    return {_SCENE_FILE: hashlib.sha256(Path(file).read_bytes()).hexdigest()}
-
-
-def is_scene_edited(begun: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
-    """Whether two records tell other bytes of the scene file; clips of earlier versions tell none."""
-    return len({record[_SCENE_FILE] for record in (begun, wanted) if _SCENE_FILE in record}) > 1
 
 
 def check_resumable(folder: Path, wanted: Mapping[str, Any], begun: Mapping[str, Any]) -> None:
@@ -42,8 +25,9 @@ def check_resumable(folder: Path, wanted: Mapping[str, Any], begun: Mapping[str,
     cameras = zip(begun.get("cameras", []), wanted["cameras"], strict=False)
     if any(_make_plain(first) != _make_plain(second) for first, second in cameras):
         differing.append("another camera path")
-    if is_scene_edited(begun, wanted):
-        differing.append(f"the scene file {wanted['scene']['file']} has been edited")
+    for name in find_edited(begun, wanted):
+        whole = f"the scene file {wanted['scene']['file']}"
+        differing.append(f"{name}, which {whole} reads, has been edited" if name else f"{whole} has been edited")
     if differing or wanted["frames"] < begun["frames"]:
         if begun["frames"] != wanted["frames"]:
             differing.insert(0, f"{begun['frames']} frames there, {wanted['frames']} wanted")

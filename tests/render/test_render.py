@@ -324,6 +324,41 @@ def test_frames_of_an_edited_scene_file_are_not_added_to_a_clip(tmp_path: Path) 
     assert read_record(clip)["frames"] == 2
 
 
+def test_frames_of_a_scene_whose_parts_are_edited_are_not_added_to_a_clip(tmp_path: Path) -> None:
+    """Of a file that is included, and of one that this one reads."""
+    files = {
+        "scene.xml": '<scene version="3.0.0"><include filename="parts/walls.xml"/></scene>',
+        "parts/walls.xml": '<scene version="3.0.0"><texture type="bitmap"><string name="filename" value="red.png"/>'
+        '<string name="filename" value="$given"/></texture></scene>',
+        "parts/red.png": "red",
+    }
+    (tmp_path / "parts").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    clip, scene, settings = tmp_path / "clip", Stage(), RenderSettings(variant="scalar_rgb", **SIZE)
+    scene.record = {"file": str(tmp_path / "scene.xml")}
+    job = ClipJob(scene.record, str(clip), 1, settings)
+    render_clip(scene, clip, settings, frames=1)
+    assert set(read_record(clip)["scene_parts_sha256"]) == {"parts/walls.xml", "red.png"}
+    assert is_finished(job)
+    for part, name in (("parts/red.png", "red.png"), ("parts/walls.xml", "parts/walls.xml")):
+        (tmp_path / part).write_text(files[part] + " ")
+        assert not is_finished(job)
+        with pytest.raises(ClipError, match=rf"; {name}, which the scene file .*scene\.xml reads, has been edited\)"):
+            render_clip(scene, clip, settings, frames=2)
+        (tmp_path / part).write_text(files[part])
+    (tmp_path / "parts/red.png").unlink()
+    with pytest.raises(ClipError, match=r"red\.png, which"):
+        render_clip(scene, clip, settings, frames=2)
+    (tmp_path / "parts/red.png").write_text("red")
+    # Clips of earlier versions do not say what the other files held.
+    record = json.loads((clip / "clip.json").read_text())
+    del record["scene_parts_sha256"]
+    (clip / "clip.json").write_text(json.dumps(record))
+    (tmp_path / "parts/red.png").write_text("blue")
+    assert is_finished(job)
+
+
 def test_without_a_plan_every_buffer_of_every_effect_is_rendered() -> None:
     frame = render_frame(Stage(), 0, RenderSettings(variant="scalar_rgb", **SIZE)).frame
     assert set(present(frame)) == set(effects.plan(effects.choose_all_effects(1)).buffers)
