@@ -1,6 +1,6 @@
 """Train the second network of ``combiner`` alone: its candidates are made once, but for the last result.
 
-    python -m experiments.cycles.combiner_choice FOLDER/train --start runs/start.safetensors -o runs/chosen --minutes 10
+    python -m experiments.cycles.combiner_choice FOLDER/train --start combiner-high --anew -o runs/chosen --minutes 10
 
 An update takes a fifth of the time that ``jaxdn train`` needs for one of everything. The last results, which depend on
 the weights, are made again every 200 updates. The loss of a pair of frames is
@@ -51,8 +51,10 @@ from jaxdn.methods.combiner.method import (
 from jaxdn.zoo.weights import load_weights, save_weights
 
 BATCH, RATE, AVERAGE = 4, 2e-3, 0.99
-"""Pairs of frames an update; Adam's step at the start, which falls to nothing as a cosine; the running mean of the
-weights."""
+"""Pairs of frames an update; Adam's largest step; the running mean of the weights."""
+WARM_UP = 200
+"""Updates until the largest step. Without them features of a network that begins anew may grow a hundredfold in the
+first ten: one candidate gets a share of exactly 1 everywhere, and no gradient is left."""
 _LEAST = 1e-5
 """Mean square below which an error is as good as none."""
 UPDATES = 200
@@ -85,11 +87,13 @@ class Options:
     folder: Annotated[Path, tyro.conf.Positional]
     """A set: the folder of clips, such as FOLDER/train. The test set is refused."""
     start: Path
-    """Weights of combiner; their first network stays as it is."""
+    """Weights of combiner, a file or the name of shipped ones; their first network stays as it is."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file of all weights, .safetensors."""
     minutes: float = 10.0
     """How long to train; what is made before does not count."""
+    anew: bool = False
+    """The second network begins as one that was never trained."""
     held: list[str] = field(default_factory=lambda: ["-0100"])
     """Endings of the names of clips that are scored, not trained on."""
     without: list[Literal["fine correction", "coarse correction", "prior mean", "last result"]] = field(
@@ -115,9 +119,14 @@ def main(options: Options) -> int:
     trained = {name: clip for name, clip in clips.items() if name not in held}
     if not trained:
         raise ValueError(f"{options.folder}: expected clips to train on, got none that does not end in {options.held}.")
+    if options.anew:
+        drawn = denoisers.combiner().init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3))))
+        params = {**params, "choice": drawn["choice"]}
     report("before", held, params["choice"])
     chosen, updates = train(trained, held, params["choice"], options.minutes)
     record = {"start": options.start.name, "choice_updates": updates, "clips": sorted(trained)}
+    if options.anew:
+        record["choice_anew"] = True
     if options.without:
         record["without"] = options.without
     path = save_weights(
@@ -254,8 +263,8 @@ def train(clips: Clips, held: Clips, params: Params, minutes: float) -> tuple[Pa
     while spent < 1:
         if updates % UPDATES == 0:
             make_results(clips, mean)
-        rate = jnp.asarray(0.5 * RATE * (1 + np.cos(np.pi * spent)), jnp.float32)
-        params, state, mean = update(params, state, mean, [draw(clips, rng) for _ in range(BATCH)], rate)
+        batch = [draw(clips, rng) for _ in range(BATCH)]
+        params, state, mean = update(params, state, mean, batch, jnp.asarray(find_rate(updates, spent), jnp.float32))
         updates += 1
         spent = (time.monotonic() - begin) / (60 * minutes) if minutes else 1.0
         if min(int(REPORTS * spent), REPORTS) > reported:
@@ -263,6 +272,11 @@ def train(clips: Clips, held: Clips, params: Params, minutes: float) -> tuple[Pa
             report(f"after {updates} updates", held, mean)
             begin += time.monotonic() - reporting
     return mean, updates
+
+
+def find_rate(updates: int, spent: float) -> float:
+    """Adam's step after so many updates, and that share of the time: a line up, then a cosine that falls to nothing."""
+    return RATE * min(1.0, (updates + 1) / WARM_UP) * 0.5 * (1 + np.cos(np.pi * spent))
 
 
 def _of_frames(errors: list[jax.Array]) -> jax.Array:

@@ -9,12 +9,15 @@ import pytest
 
 from experiments.cycles import combiner_choice
 from experiments.cycles.combiner_choice import (
+    RATE,
+    WARM_UP,
     Options,
     Sequence,
     collect,
     draw,
     fetch_result,
     find_errors,
+    find_rate,
     main,
     make_results,
     square,
@@ -23,6 +26,7 @@ from experiments.cycles.record import RECORD, read_record
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import combiner
 from jaxdn.methods.combiner.candidates import CANDIDATES
+from jaxdn.methods.combiner.choice import INITIAL_LOGITS
 from jaxdn.methods.combiner.history import Past, fetch_past, keep_history, measure_now
 from jaxdn.methods.combiner.method import Options as Settings
 from jaxdn.methods.combiner.method import build_candidate_step
@@ -116,6 +120,18 @@ def test_training_changes_the_second_network_alone(tmp_path: Path, capsys: pytes
         jax.tree.map(np.testing.assert_array_equal, before[name], after[name])
     changed = jax.tree.map(lambda old, new: bool(np.any(old != new)), before["choice"], after["choice"])
     assert any(jax.tree.leaves(changed))
+    assert main(Options(tmp_path / "train", START, tmp_path / "out.safetensors", minutes=0.0, anew=True)) == 0
+    begun = load_weights(tmp_path / "out.safetensors")[1]["choice"]["head_0"]["bias"]
+    np.testing.assert_allclose(begun, np.repeat([INITIAL_LOGITS[name] for name in CANDIDATES], 4), atol=0.01)
+
+
+def test_steps_grow_from_nearly_nothing_and_fall_to_nothing() -> None:
+    """A network that begins anew and takes whole steps at once, may be stuck after ten: all shares are 0 or 1."""
+    assert find_rate(0, 0.0) == pytest.approx(RATE / WARM_UP)
+    assert find_rate(WARM_UP // 2 - 1, 0.0) == pytest.approx(RATE / 2)
+    assert find_rate(10 * WARM_UP, 0.0) == pytest.approx(RATE)
+    assert find_rate(10 * WARM_UP, 0.5) == pytest.approx(RATE / 2)
+    assert find_rate(10 * WARM_UP, 1.0) == 0.0
 
 
 @pytest.mark.slow
