@@ -25,6 +25,7 @@ from experiments.papers.learned import (
     zeng_ablation,
     zeng_methods,
 )
+from experiments.results_page import read_results, results_page
 from jaxdn import denoisers
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, recurrent
@@ -110,6 +111,11 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     assert [len(drawn["ntasd"][name]) for name in ("ssim", "mse")] == [4, 4]
     assert min(drawn["ntasd"]["mse"]) > 0
     assert (tmp_path / "runs" / "curves.png").is_file()
+    # The page of results takes what is written for it.
+    page = results_page(read_results(tmp_path / "runs" / "measurements"))
+    assert "### One, 4 samples a pixel" in page
+    assert re.search(r"\| `svgf` \| \*\*\d", page), page
+    assert "### Zeng et al. 2021, figure 8: 4 frames" in page
     with_it, without = (
         tmp_path / "runs" / each / "weights.safetensors" for each in ("ntasd-uniform", "ntasd-uniform-without-parlour")
     )
@@ -291,7 +297,7 @@ def test_errors_of_a_long_clip_are_given_frame_by_frame() -> None:
     assert "| svgf | SSIM | 0.5000 | 0.9000 | 0.7500 |" in text
     assert "| svgf | MSE | 0.2500 | 0.2500 | 0.2500 |" in text
     with pytest.raises(ValueError, match="--curve-frames: expected at least 2, or 0 for none, got 1"):
-        curves.draw_curves(stages.Settings(curve_frames=1))
+        curves.measure_curves(stages.Settings(curve_frames=1))
 
 
 def test_curves_over_frames_are_means_over_clips() -> None:

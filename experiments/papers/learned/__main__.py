@@ -5,7 +5,7 @@
 Renders clips with layers of 1 to 32 samples, trains every network that a table needs, in its small size with the same
 number of updates and four samples a pixel (one for table 2 of Zeng et al.), and scores them on clips of seeds and
 scenes that none has seen. Writes ``runs/papers/report.md`` with every table and claim, ``report.html``, every method's
-image, and maps of samples.
+image, maps of samples, and in ``measurements`` each table in the format of docs/results.
 """
 
 from pathlib import Path
@@ -21,14 +21,16 @@ from experiments.papers.learned import (
     zeng_ablation,
     zeng_methods,
 )
-from experiments.papers.learned.curves import draw_curves
+from experiments.papers.learned.curves import make_table, measure_curves
 from experiments.papers.learned.maps import asks, save_maps
+from experiments.papers.learned.record import record_curves, record_table
 from experiments.papers.learned.scores import Table, claims_table, read
 from experiments.papers.learned.stages import BUDGET, Settings, ready, render_all
 from experiments.papers.preintegration import save_pictures
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import Results, write_report
+from jaxdn.runtime.atomic_files import write_json
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE
@@ -60,7 +62,10 @@ def main(settings: Settings) -> None:
     for spp in sorted({one.spp for one in tables}, reverse=True):
         text += compared([one for one in tables if one.spp == spp], folders, settings, spp)
     if settings.curve_frames:
-        text.append(draw_curves(settings))
+        curves = measure_curves(settings)
+        write_json(settings.results / "curves.json", curves)
+        write_json(settings.measurements / "quality-papers-curves.json", record_curves(curves, settings))
+        text.append(f"## Zeng et al. 2021, figure 8: {settings.curve_frames} frames\n\n{make_table(curves)}")
     report = settings.results / "report.md"
     report.write_text("\n\n".join(text) + "\n")
     print("\n\n".join(text))
@@ -76,6 +81,10 @@ def compared(tables: list[Table], folders: list[Path], settings: Settings, spp: 
     out = settings.results if spp == BUDGET else settings.results / f"{spp}-samples"
     write_report(found, out)
     save_pictures(found, out / "pictures")
+    for name, one in TABLES.items():
+        if one in tables:
+            file = settings.measurements / f"quality-papers-{name.replace('_', '-')}.json"
+            write_json(file, record_table(one, found, settings))
     text = sections(tables, found)
     if asking := [one for one in methods if asks(one)]:
         maps = save_maps(asking, folders, out / "pictures")

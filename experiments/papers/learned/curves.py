@@ -3,6 +3,7 @@
 Clips of eight frames never reach the state in which a history has forgotten how it began.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from jaxdn.clips import read_clip
 from jaxdn.core.frame import Clip
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.render.settings import RenderSettings
-from jaxdn.runtime.atomic_files import write_json
 from jaxdn.sequence.render_jobs import ClipSource, render
 
 FAMILY = "robot"
@@ -28,8 +28,8 @@ SHOWN = (2, 5, 10, 30, 100, 300)
 """Frames, from 1, whose errors the report gives."""
 
 
-def draw_curves(settings: Settings) -> str:
-    """Render the clip, measure every method of table 2 on it, write ``curves.json`` and ``curves.png``; Markdown.
+def measure_curves(settings: Settings) -> dict[str, dict[str, list[float]]]:
+    """Render the clip and measure every method of table 2 on it: row -> metric -> frames; draws ``curves.png``.
 
     Raises ValueError for fewer than two frames: the figure begins with the second.
     """
@@ -37,9 +37,8 @@ def draw_curves(settings: Settings) -> str:
         raise ValueError(f"--curve-frames: expected at least 2, or 0 for none, got {settings.curve_frames}.")
     clip = read_clip(_render(settings), spp=1, layers=True)
     found = {row: measure_frames(row, clip, settings) for row in zeng_methods.ROWS}
-    write_json(settings.results / "curves.json", found)
     _draw(found, settings.results / "curves.png")
-    return f"## Zeng et al. 2021, figure 8: {settings.curve_frames} frames, 1 sample a pixel\n\n{make_table(found)}"
+    return found
 
 
 def measure_frames(row: str, clip: Clip, settings: Settings) -> dict[str, list[float]]:
@@ -54,14 +53,24 @@ def measure_frames(row: str, clip: Clip, settings: Settings) -> dict[str, list[f
 def make_table(found: dict[str, dict[str, list[float]]]) -> str:
     """Errors of some frames, and their mean from the second on, as Markdown."""
     count = len(next(iter(found.values()))[METRICS[0]])
-    shown = [number for number in SHOWN if number <= count]
+    shown = choose_frames(count)
     lines = ["| method | | " + " | ".join(f"frame {number}" for number in shown) + " | mean from 2 on |"]
     lines.append("|---" * (len(shown) + 3) + "|")
     for row, curves in found.items():
         for name, values in curves.items():
-            cells = [values[number - 1] for number in shown] + [float(np.mean(values[1:]))]
+            cells = [values[number - 1] for number in shown] + [find_mean(values)]
             lines.append(f"| {row} | {name.upper()} | " + " | ".join(f"{value:.4f}" for value in cells) + " |")
     return "\n".join(lines)
+
+
+def choose_frames(count: int) -> list[int]:
+    """Those of :data:`SHOWN` that a clip of so many frames has."""
+    return [number for number in SHOWN if number <= count]
+
+
+def find_mean(values: Sequence[float]) -> float:
+    """From the second frame on, where the figure begins."""
+    return float(np.mean(values[1:]))
 
 
 def _render(settings: Settings) -> Path:

@@ -129,6 +129,13 @@ class Settings:
         """The folder of this run's networks, tables and pictures."""
         return self.out / "as-published" if self.as_published else self.out
 
+    @property
+    def measurements(self) -> Path:
+        """The folder of the tables for the page of results, which exists."""
+        folder = self.results / "measurements"
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
 
 def render_all(settings: Settings) -> list[Path]:
     """Render what is missing: clips to train on, of seeds from 0 on, and to test on, which are returned."""

@@ -1,0 +1,106 @@
+"""The papers' tables as measurements for the page of results (:mod:`experiments.measurement`)."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from experiments.cycles.reference import decibels
+from experiments.measurement import describe_measurement
+from experiments.papers.learned.curves import METRICS, choose_frames, find_mean
+from experiments.papers.learned.scores import Claim, Table, rows_of
+from experiments.papers.learned.stages import FAMILIES, Settings
+from jaxdn.evaluation.report import Results
+from jaxdn.evaluation.report.results import Scores, mean_scores
+
+COLUMNS: Mapping[str, tuple[Callable[[Scores], float], int, str]] = {
+    "PSNR": (lambda one: one.unbiased_psnr, 2, "higher"),
+    "temporal PSNR": (lambda one: one.unbiased_temporal_psnr, 2, "higher"),
+    "disoccluded PSNR": (lambda one: decibels(one.unbiased_disoccluded_mse), 2, "higher"),
+    "SSIM": (lambda one: one.ssim, 4, "higher"),
+    "MSE": (lambda one: one.unbiased_mse, 5, "lower"),
+    "FLIP": (lambda one: one.flip, 3, "lower"),
+    "relative MSE": (lambda one: one.unbiased_relative_mse, 4, "lower"),
+}
+"""Title of a column -> its value, the decimals, what is best."""
+_ORDER, _CURVES_ORDER = 71.0, 72.0
+
+
+def record_table(one: Table, found: Results, settings: Settings) -> dict[str, Any]:
+    """The scores of a table's rows, means over the test clips, with what holds of the paper's claims as notes."""
+    means = mean_scores(rows_of(found, one.rows))
+    rows = [
+        [f"`{label}`", *(_round(value(scores), decimals) for value, decimals, _ in COLUMNS.values())]
+        for label, scores in means.items()
+    ]
+    what = (
+        f"Means over {len(found.clips)} test clips of other seeds. {_describe(settings)} "
+        "All columns but SSIM and FLIP are without the references' noise."
+    )
+    columns = [{"name": title, "decimals": decimals, "best": best} for title, (_, decimals, best) in COLUMNS.items()]
+    title = one.heading + (", as published" if settings.as_published else "")
+    described = describe_measurement(
+        "table", title, "Quality", _ORDER, command=_command(settings), what=what, rows=rows
+    )
+    return {
+        **described,
+        "columns": [{"name": "method"}, *columns],
+        "notes": [_tell(claim) for claim in one.claims(found)],
+    }
+
+
+def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: Settings) -> dict[str, Any]:
+    """Row of table 2 -> metric -> frames, of :func:`experiments.papers.learned.curves.measure_curves`."""
+    shown = choose_frames(settings.curve_frames)
+    rows = [
+        [
+            f"`{row}`",
+            name.upper(),
+            *(round(curves[name][number - 1], 4) for number in shown),
+            round(find_mean(curves[name]), 4),
+        ]
+        for row, curves in found.items()
+        for name in METRICS
+    ]
+    titles = ["method", "error", *(f"frame {number}" for number in shown), "mean from 2 on"]
+    described = describe_measurement(
+        "table",
+        f"Zeng et al. 2021, figure 8: {settings.curve_frames} frames"
+        + (", as published" if settings.as_published else ""),
+        "Quality",
+        _CURVES_ORDER,
+        command=_command(settings),
+        what=f"Errors of one clip, 1 sample a pixel, with the references' noise. {_describe(settings)}",
+        rows=rows,
+    )
+    return {**described, "columns": [{"name": title} for title in titles]}
+
+
+def _describe(settings: Settings) -> str:
+    how = ", by the presets and recipes of their papers" if settings.as_published else ""
+    return (
+        f"Clips of {settings.size} x {settings.size} pixels; {settings.clips} training clips of 8 frames of each of "
+        f"{len(FAMILIES) + len(settings.rooms)} families and rooms, {settings.steps} updates of small networks{how}."
+    )
+
+
+def _command(settings: Settings) -> str:
+    """What measures it again, in a folder of its own."""
+    words = ["python -m experiments.papers.learned", "--tables", *settings.tables] if settings.tables else []
+    words = words or ["python -m experiments.papers.learned"]
+    words += ["--as-published"] * settings.as_published
+    for name in ("steps", "clips", "frames", "size", "curve_frames"):
+        if getattr(settings, name) != getattr(Settings(), name):
+            words += [f"--{name.replace('_', '-')}", str(getattr(settings, name))]
+    for name, places in (("rooms", settings.rooms), ("scenes", settings.scenes)):
+        words += [f"--{name}", *(place.name for place in places)] if places else []
+    return " ".join(words)
+
+
+def _tell(claim: Claim) -> str:
+    return (
+        f"{claim.text}: {claim.paper} in the paper, {claim.ours} here; {'holds' if claim.holds else 'does not hold'}."
+    )
+
+
+def _round(value: float, decimals: int) -> float | None:
+    return round(float(value), decimals) if math.isfinite(value) else None
