@@ -110,9 +110,11 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     drawn = json.loads((tmp_path / "runs" / "curves.json").read_text())
     assert [len(drawn["ntasd"][name]) for name in ("ssim", "mse")] == [4, 4]
     assert min(drawn["ntasd"]["mse"]) > 0
-    assert (tmp_path / "runs" / "curves.png").is_file()
     # The page of results takes what is written for it.
-    page = results_page(read_results(tmp_path / "runs" / "measurements"))
+    measurements = tmp_path / "runs" / "measurements"
+    page = results_page(read_results(measurements))
+    assert f"]({curves.PICTURE})" in page
+    assert (measurements / curves.PICTURE).is_file()
     assert "### One, 4 samples a pixel" in page
     assert re.search(r"\| `svgf` \| \*\*\d", page), page
     assert "### Zeng et al. 2021, figure 8: 4 frames" in page

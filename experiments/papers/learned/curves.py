@@ -24,12 +24,14 @@ FAMILY = "robot"
 """What is filmed: an arm that moves all the time, so that every frame has disocclusions."""
 METRICS = ("ssim", "mse")
 """Those of the figure, of tone-mapped images."""
+PICTURE = "papers-curves.png"
+"""Beside the measurements."""
 SHOWN = (2, 5, 10, 30, 100, 300)
 """Frames, from 1, whose errors the report gives."""
 
 
 def measure_curves(settings: Settings) -> dict[str, dict[str, list[float]]]:
-    """Render the clip and measure every method of table 2 on it: row -> metric -> frames; draws ``curves.png``.
+    """Render the clip and measure every method of table 2 on it: row -> metric -> frames; draws :data:`PICTURE`.
 
     Raises ValueError for fewer than two frames: the figure begins with the second.
     """
@@ -37,7 +39,7 @@ def measure_curves(settings: Settings) -> dict[str, dict[str, list[float]]]:
         raise ValueError(f"--curve-frames: expected at least 2, or 0 for none, got {settings.curve_frames}.")
     clip = read_clip(_render(settings), spp=1, layers=True)
     found = {row: measure_frames(row, clip, settings) for row in zeng_methods.ROWS}
-    _draw(found, settings.results / "curves.png")
+    _draw(found, settings.measurements / PICTURE)
     return found
 
 

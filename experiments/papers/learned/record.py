@@ -6,7 +6,7 @@ from typing import Any
 
 from experiments.cycles.reference import decibels
 from experiments.measurement import describe_measurement
-from experiments.papers.learned.curves import METRICS, choose_frames, find_mean
+from experiments.papers.learned.curves import METRICS, PICTURE, choose_frames, find_mean
 from experiments.papers.learned.scores import Claim, Table, rows_of
 from experiments.papers.learned.stages import FAMILIES, Settings
 from jaxdn.evaluation.report import Results
@@ -72,7 +72,12 @@ def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: 
         what=f"Errors of one clip, 1 sample a pixel, with the references' noise. {_describe(settings)}",
         rows=rows,
     )
-    return {**described, "columns": [{"name": title} for title in titles]}
+    picture = {
+        "file": PICTURE,
+        "alt": "SSIM and MSE of each method over the frames",
+        "caption": "Every frame of the clip.",
+    }
+    return {**described, "columns": [{"name": title} for title in titles], "picture": picture}
 
 
 def _describe(settings: Settings) -> str:
