@@ -168,6 +168,16 @@ def test_claims_hold_or_not_by_the_numbers() -> None:
     assert "| NTASD is steadier than DASR, temporal PSNR | above 0 | -1.00 dB | not here |" in text
 
 
+def test_half_of_the_distance_that_a_paper_found_is_its_finding() -> None:
+    psnr = {"svgf": 24.0, zeng_methods.NTASD: 29.8, "trmv": 29.0, zeng_methods.OURS: 30.0}
+    claims = zeng_methods.claims(results_of(**{label: {"unbiased_psnr": value} for label, value in psnr.items()}))
+    assert [(claim.ours, claim.holds) for claim in claims] == [
+        ("+6.00 dB", True),
+        ("+0.20 dB", False),
+        ("+1.00 dB", True),
+    ]
+
+
 def test_the_loss_of_a_family_is_that_of_its_own_clips(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour", "mobile"))
     seen = ntasd_holdout.SEEN
