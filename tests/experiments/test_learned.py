@@ -106,7 +106,7 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
         assert (tmp_path / "runs" / "pictures" / "fruit-2000" / f"{name}.png").is_file()
     for folder in ("", "1-samples"):
         assert (tmp_path / "runs" / folder / "report.html").is_file()
-    assert re.search(r"## Two, 1 samples a pixel\n\n.*\n.*\n\| svgf \| \d", text), text
+    assert re.search(r"## Two, 1 sample a pixel\n\n.*\n.*\n\| svgf \| \d", text), text
     drawn = json.loads((tmp_path / "runs" / "curves.json").read_text())
     assert [len(drawn["ntasd"][name]) for name in ("ssim", "mse")] == [4, 4]
     assert min(drawn["ntasd"]["mse"]) > 0

@@ -19,7 +19,7 @@ from jaxdn.methods.registry import method_named
 from jaxdn.recipes.augmentation import Augmentation
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
-from jaxdn.runtime.interrupt import Terminated
+from jaxdn.runtime.interrupt import Stopped, Terminated
 from jaxdn.runtime.locks import LOCK, lock_folder
 from jaxdn.training import loop as loop
 from jaxdn.training.checkpoint import Checkpoints
@@ -208,7 +208,7 @@ def test_an_update_varies_its_clips_as_they_were_drawn(clips):
     assert losses[0] != pytest.approx(losses[2], rel=0.1)
 
 
-@pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, Stopped), (signal.SIGTERM, Terminated)])
 def test_a_signal_on_a_logging_step_keeps_its_log_entry(number, error, clips, tmp_path, monkeypatch):
     before = signal.getsignal(number)  # SIGINT is ignored in a process that a shell put into the background
     whole = run_gain(clips, tmp_path / "whole")

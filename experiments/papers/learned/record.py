@@ -77,7 +77,8 @@ def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: 
         "alt": "SSIM and MSE of each method over the frames",
         "caption": "Every frame of the clip.",
     }
-    return {**described, "columns": [{"name": title} for title in titles], "picture": picture}
+    columns = [{"name": title, "decimals": 4} for title in titles]
+    return {**described, "columns": columns, "picture": picture}
 
 
 def _describe(settings: Settings) -> str:

@@ -45,7 +45,7 @@ class Table(NamedTuple):
     @property
     def heading(self) -> str:
         """The title, with the samples a pixel where all methods have the same."""
-        return self.title if self.budgets else f"{self.title}, {self.spp} samples a pixel"
+        return self.title if self.budgets else f"{self.title}, {self.spp} sample{'s' * (self.spp > 1)} a pixel"
 
 
 def read(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
