@@ -96,9 +96,7 @@ class Options:
     """The second network begins as one that was never trained."""
     held: list[str] = field(default_factory=lambda: ["-0100"])
     """Endings of the names of clips that are scored, not trained on."""
-    without: list[Literal["fine correction", "coarse correction", "prior mean", "last result"]] = field(
-        default_factory=list
-    )
+    without: list[Literal["correction", "prior mean", "last result"]] = field(default_factory=list)
     """Candidates that are the prior instead: what they are worth. Such weights are for the scores alone."""
 
 

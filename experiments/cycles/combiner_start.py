@@ -20,12 +20,10 @@ import tyro
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Params
-from jaxdn.methods.combiner.method import FEATURES, HALF_FEATURES, INITIAL, combiner
+from jaxdn.methods.combiner.method import combiner
 from jaxdn.zoo.weights import load_weights, save_weights
 
 FROM = "steady-balanced"
-STEADY_SHARES = 5
-"""Logits of a pixel that steady's network predicts, trust and accumulation first."""
 
 
 @dataclass
@@ -48,25 +46,15 @@ def take_over(steady: Params) -> Params:
     new = combiner().init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3))))
     params = {**steady, "guide": {**new["guide"]}, "choice": new["choice"], "head_0": {}}
     for name in new["guide"].keys() & steady["guide"].keys():
-        params["guide"][name] = steady["guide"][name]
+        params["guide"][name] = steady["guide"][name][:1]  # of full resolution
     first, widened = steady["encoder_0"]["convolution_0"], new["encoder_0"]["convolution_0"]
     old, wide = first["kernel"].shape[2], jnp.zeros_like(widened["kernel"])
     kernel = wide.at[:, :, :old].set(first["kernel"])
     params["encoder_0"] = {**steady["encoder_0"], "convolution_0": {**first, "kernel": kernel}}
-    # Steady's last features are larger than those that the scale of a new kernel is made for.
-    begin = {**new["head_0"], "kernel": jnp.zeros_like(new["head_0"]["kernel"])}
-    params["head_0"] = {leaf: _head(each, steady["head_0"][leaf]) for leaf, each in begin.items()}
+    # Features of four pixels, trust and the share of the new frame are the first of what steady's network says.
+    channels = new["head_0"]["bias"].size
+    params["head_0"] = {leaf: each[..., :channels] for leaf, each in steady["head_0"].items()}
     return params
-
-
-def _head(new: jax.Array, steady: jax.Array) -> jax.Array:
-    """Kernel or bias of the head: the channels that both have from steady."""
-    learned = 4 * FEATURES + 4 * 2  # features of four pixels, then trust and share of the new frame
-    here, there = 4 * (FEATURES + len(INITIAL)), 4 * (FEATURES + STEADY_SHARES)
-    rest = new.shape[-1] - here
-    if rest <= HALF_FEATURES or steady.shape[-1] < there + rest:
-        raise ValueError(f"{FROM}: expected a head of {there + rest} channels at least, got {steady.shape[-1]}.")
-    return new.at[..., :learned].set(steady[..., :learned]).at[..., here:].set(steady[..., there : there + rest])
 
 
 if __name__ == "__main__":

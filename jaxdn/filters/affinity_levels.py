@@ -1,4 +1,4 @@
-"""What pyramids of affinity filters (:mod:`jaxdn.ops.affinity.filter`) share, whatever tells likeness in them.
+"""What levels of affinity filters (:mod:`jaxdn.ops.affinity.filter`) share, whatever tells likeness in them.
 
 Taps of a level lie twice as far apart as those of the level before: 1, 2 ... pixels at full resolution, and as many of
 the larger pixels at half.
@@ -16,8 +16,6 @@ from jaxdn.ops.affinity.filter import Guide
 
 LEAST_TRUST = 1e-3
 """So that a pixel is filtered even where none is trusted."""
-_LIKENESS = 0.02
-"""Weight of coarse pixels at which half of the enlarged image is taken."""
 
 
 def compute_inverse_depth(depth: jax.Array, statistics: FrameStatistics) -> jax.Array:
@@ -26,11 +24,6 @@ def compute_inverse_depth(depth: jax.Array, statistics: FrameStatistics) -> jax.
     known = (depth > 0) & (depth < FAR)
     inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / statistics.mean_inverse_depth
     return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
-
-
-def halve_inverse_depth(inverse_depth: jax.Array) -> jax.Array:
-    """[3, H/2, W/2] that of every other pixel, with the slopes of pixels twice as large."""
-    return inverse_depth[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
 
 
 def scale_guide(guide: Guide, factors: Mapping[str, jax.Array], index: int, channels: Mapping[str, int]) -> Guide:
@@ -46,11 +39,6 @@ def scale_guide(guide: Guide, factors: Mapping[str, jax.Array], index: int, chan
     return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
 
 
-def weigh_enlarged(weight: jax.Array) -> jax.Array:
-    """[H, W] in [0, 1], how much of an enlarged image is taken where its coarse pixels had this weight."""
-    return weight / (weight + _LIKENESS)
-
-
-def receptive_field(full_levels: int, half_levels: int) -> int:
+def receptive_field(full_levels: int, half_levels: int = 0) -> int:
     """How far, in pixels, so many levels at full and at half resolution see; 16 for blocks, slopes and enlarging."""
     return 2 * (2**full_levels - 1) + sum(4 * 2**index for index in range(half_levels)) + 16

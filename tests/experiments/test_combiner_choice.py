@@ -140,11 +140,11 @@ def test_the_prior_stands_for_what_is_left_out(tmp_path: Path) -> None:
     write_cycles_clip(tmp_path / "sun-0000", "train")
     frames = (read_record(tmp_path / "sun-0000" / RECORD) or {})["frames"]
     find, params = jax.jit(build_candidate_step(Settings())), load_weights(START)[1]
-    sequence = collect(tmp_path / "sun-0000", find, params, frames, ["coarse correction", "last result"])[1]
-    prior, fine, coarse, _, last = np.moveaxis(sequence.stored["light"][:, :-1], 1, 0)
-    np.testing.assert_array_equal(coarse, prior)
+    sequence = collect(tmp_path / "sun-0000", find, params, frames, ["prior mean", "last result"])[1]
+    prior, correction, mean, last = np.moveaxis(sequence.stored["light"][:, :-1], 1, 0)
+    np.testing.assert_array_equal(mean, prior)
     np.testing.assert_array_equal(last, prior)
-    assert np.any(fine != prior)
+    assert np.any(correction != prior)
     held = sequence.stored["light"].copy()
     make_results({"one": {1: sequence}}, params["choice"])
     np.testing.assert_array_equal(sequence.stored["light"], held)

@@ -29,8 +29,7 @@ RECEPTIVE_FIELD = 2 * max(RADII) + 2
 """Radius in pixels of what :func:`assemble_evidence` sees."""
 INITIAL_LOGITS = {
     "prior": 0.0,
-    "fine correction": -2.5,
-    "coarse correction": -2.0,
+    "correction": -2.0,
     "prior mean": 1.0,
     "last result": 1.0,
 }
@@ -97,6 +96,6 @@ def begin(params: Params) -> Params:
 
 
 def split_shares(head: jax.Array, size: tuple[int, int]) -> jax.Array:
-    """[5, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 20]."""
+    """[4, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 16]."""
     own = crop(head, (size[0] // 2, size[1] // 2))
     return jax.nn.softmax(join_planes([("blocks", own)]), axis=0)

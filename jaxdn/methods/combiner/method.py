@@ -2,10 +2,10 @@
 
 For each frame: the library denoises it alone (the *prior*); the noisy frame, the prior and the guides are blended into
 running means along motion (:mod:`jaxdn.methods.combiner.history`); affinities filter the means of noisy light and of
-the prior's images, at full and at half resolution (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of
-five candidates: the prior, the prior with the correction that filtered samples tell of, at two scales, the mean of
-priors, and the last result. With ``prefilter`` the library denoises each frame twice, the second time with guides that
-it denoises first, and the prior is the mean of both.
+the prior's images (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of four candidates: the prior, the
+prior with the correction that filtered samples tell of, the mean of priors, and the last result. With ``prefilter`` the
+library denoises each frame twice, the second time with guides that it denoises first, and the prior is the mean of
+both.
 
 A U-Net at half resolution decides for every pixel how fast the means follow, the filter's features and how far a pixel
 is trusted. A second, smaller one sees the candidates and what noisy light says about each, and decides their weights
@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxdn import color
 from jaxdn.core.frame import RADIANCE_MAX, Frame
@@ -32,7 +31,6 @@ from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.combiner import choice
 from jaxdn.methods.combiner.candidates import (
     CANDIDATES,
-    LEVELS,
     FilterParameters,
     make_candidates,
     receptive_field,
@@ -63,17 +61,13 @@ WIDTHS: dict[str, Widths] = {
 """Channels of the U-Net's convolutions, from half resolution down."""
 CHOICE_WIDTHS: dict[str, Widths] = {"high": ((32,),) * 5, "fast": ((16,),) * 5}
 """Channels of the second network."""
-FEATURES, HALF_FEATURES = 5, 8
-"""Learned features at full and at half resolution."""
+FEATURES = 5
+"""Learned features of a pixel."""
 INITIAL = {"trust": 4.0, "follow": 0.0}
 """Parameters of every pixel, one logit each, and what they are before training: how far its light is trusted; the
 share of the new frame in the means."""
 PRECISIONS = {"albedo": 1.0, "normal": 1.0, "light": 4.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
-_LEVEL_WEIGHT = 4.0
-"""Initial logit of the weight of each level at half resolution."""
-_SPLITS = np.cumsum([4 * FEATURES, 4 * len(INITIAL), HALF_FEATURES]).tolist()
-"""Channels of the head from which on it says something else."""
 _MULTIPLE, _BLOCKS = 16, 4
 """What height and width are multiples of: of the network's input, at half resolution; of the filter's planes."""
 _DARK = 1e-3
@@ -152,10 +146,8 @@ def combiner(options: Options) -> Denoiser:
         params = network.init(key)
         chosen = choice.begin(chooser.init(jax.random.fold_in(key, 1)))
         pixel = [0.0] * FEATURES + list(INITIAL.values())
-        bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
-        bias += [INITIAL["trust"]] + [_LEVEL_WEIGHT] * LEVELS
-        precisions = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
-        head = {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}
+        precisions = {name: jnp.full((1,), value, jnp.float32) for name, value in PRECISIONS.items()}
+        head = {**params["head_0"], "bias": jnp.repeat(jnp.asarray(pixel, jnp.float32), 4)}
         return {**params, "head_0": head, "guide": precisions, "choice": chosen}
 
     def start(params: Params, frame: Frame) -> CombinerState:
@@ -257,7 +249,7 @@ def _build_network(options: Options) -> tuple["Network", graph.GraphSpec]:
     from jaxdn.networks.unet import unet
 
     widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
-    heads = (4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS,)
+    heads = (4 * (FEATURES + len(INITIAL)),)
     groups = tuple(INPUTS.values())
     network = unet(groups, heads, widths=widths, head_size=1, implementation=options.implementation)
     return network, graph.unet(1, heads, widths=widths, head_size=1)
@@ -310,13 +302,12 @@ def _assemble_network_input(
 def _split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters, jax.Array]:
     """Of the first network's output: the filter's parameters, and the share [H, W] of the new frame."""
     height, width = size[0] // 2, size[1] // 2
-    own, logits, half, rest = jnp.split(crop(head, (height, width)), _SPLITS, axis=-1)
+    own, logits = jnp.split(crop(head, (height, width)), [4 * FEATURES], axis=-1)
     planes = join_planes([("blocks", logits)])
     trust, follow = jax.nn.sigmoid(planes[0]), jax.nn.sigmoid(planes[1])
     # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
     follow = upsample(downsample(follow[..., None]))[..., 0]
-    rest = jax.nn.sigmoid(to_planes(rest))
-    return FilterParameters(own, trust, half, rest[0], rest[1:]), follow
+    return FilterParameters(own, trust), follow
 
 
 def _mix(shares: jax.Array, candidates: list[jax.Array], gain: jax.Array) -> jax.Array:

@@ -19,7 +19,7 @@ from jaxdn import brdf
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters import affinity_levels
-from jaxdn.filters.affinity_levels import LEAST_TRUST, halve_inverse_depth, scale_guide, weigh_enlarged
+from jaxdn.filters.affinity_levels import LEAST_TRUST, scale_guide
 from jaxdn.filters.surface_test import surface_mask
 from jaxdn.methods.steady import lighting_change, regression
 from jaxdn.methods.steady.accumulation import FilteredLight
@@ -31,6 +31,8 @@ LEVELS = 4
 """Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
 BLOCKS = 4
 """Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
+_LIKENESS = 0.02
+"""Weight of pixels at half resolution at which half of the enlarged image is taken."""
 _CHANNELS = {"albedo": 3, "gloss": 1, "normal": 3}
 """What likeness is told by, besides learned features and depth, and its channels."""
 
@@ -162,7 +164,8 @@ def _filter_at_half(
 
     They are followed by the three of the change, if there may be one.
     """
-    inverse_depth_half = halve_inverse_depth(inverse_depth)
+    # Of every other pixel, with the slopes of pixels twice as large.
+    inverse_depth_half = inverse_depth[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     hit, own = _any_of_four(surfaces.hit), parameters.half_features
     halved = join_planes(surfaces.guides("means"))
     at_half = _guide([("planes", halved), ("pixels", own)], inverse_depth_half, parameters.half_trust, hit)
@@ -175,7 +178,7 @@ def _filter_at_half(
     features = [("planes", halved), ("corners", parameters.features)]
     there = _guide(features, inverse_depth[:, ::2, ::2], parameters.half_trust, hit)
     enlarged, weight = joint_bilateral_upsample(found, there, at_full)
-    return enlarged, weigh_enlarged(weight)
+    return enlarged, weight / (weight + _LIKENESS)
 
 
 def _any_of_four(hit: jax.Array) -> jax.Array:
