@@ -94,7 +94,7 @@ def test_results_are_made_in_the_order_of_frames(rng: np.random.Generator, trust
     """Nothing moves: the last result of a frame is the prior of the frame before, or for ever the first one."""
     require("pyoidn")
     params = combiner().init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3))))["choice"]
-    bias = np.repeat([0.0 if name == trusted else -1e3 for name in CANDIDATES], 4)
+    bias = [0.0 if name == trusted else -1e3 for name in CANDIDATES]
     head = {"kernel": jnp.zeros_like(params["head_0"]["kernel"]), "bias": jnp.asarray(bias, jnp.float32)}
     light = rng.uniform(0.2, 1.0, (4, len(CANDIDATES) + 1, 3, 24, 32)).astype(np.float16)
     light[:, CANDIDATES.index("last result")] = light[:, 0]
@@ -122,7 +122,7 @@ def test_training_changes_the_second_network_alone(tmp_path: Path, capsys: pytes
     assert any(jax.tree.leaves(changed))
     assert main(Options(tmp_path / "train", START, tmp_path / "out.safetensors", minutes=0.0, anew=True)) == 0
     begun = load_weights(tmp_path / "out.safetensors")[1]["choice"]["head_0"]["bias"]
-    np.testing.assert_allclose(begun, np.repeat([INITIAL_LOGITS[name] for name in CANDIDATES], 4), atol=0.01)
+    np.testing.assert_allclose(begun, [INITIAL_LOGITS[name] for name in CANDIDATES], atol=0.01)
 
 
 def test_steps_grow_from_nearly_nothing_and_fall_to_nothing() -> None:

@@ -13,7 +13,7 @@ from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import combiner, oidn
 from jaxdn.methods.combiner.candidates import CANDIDATES, FilterParameters, make_candidates
-from jaxdn.methods.combiner.choice import RADII, assemble_evidence, count_inputs
+from jaxdn.methods.combiner.choice import RADII, assemble_evidence, count_inputs, split_shares
 from jaxdn.methods.combiner.history import (
     Means,
     Past,
@@ -69,7 +69,7 @@ def deciding(weights_of_candidates, follow=0.0):
     head = {"kernel": jnp.zeros_like(params["head_0"]["kernel"]), "bias": jnp.asarray(bias)}
     shares = {
         "kernel": jnp.zeros_like(params["choice"]["head_0"]["kernel"]),
-        "bias": jnp.asarray(np.repeat([logits[name] for name in CANDIDATES], 4), jnp.float32),
+        "bias": jnp.asarray([logits[name] for name in CANDIDATES], jnp.float32),
     }
     return {**params, "head_0": head, "choice": {**params["choice"], "head_0": shares}}
 
@@ -289,6 +289,20 @@ def test_the_first_weights_take_over_what_steady_knows():
     np.testing.assert_array_equal(params["head_0"]["bias"], steady["head_0"]["bias"][:28])
     jax.tree.map(np.testing.assert_array_equal, params["choice"], like["choice"])
     np.testing.assert_array_equal(params["guide"]["albedo"], steady["guide"]["albedo"][:1])
+
+
+def test_shares_are_those_of_blocks_enlarged(rng):
+    """Pixels of a block have none of their own: where candidates differ much, those showed as a grid."""
+    logits = rng.normal(0, 2, (5, 8, len(CANDIDATES)))  # padded by a row and two columns
+    found = split_shares(jnp.asarray(logits, jnp.float32), (8, 12))
+
+    def enlarge(lines):
+        blocks = np.arange(len(lines)) + 0.5
+        return np.stack([np.interp(np.arange(0.25, len(lines), 0.5), blocks, line) for line in lines.T], axis=1)
+
+    tall = np.stack([enlarge(logits[:4, column]) for column in range(6)], axis=1)
+    expected = np.exp(np.stack([enlarge(row) for row in tall])).transpose(2, 0, 1)
+    np.testing.assert_allclose(found, expected / expected.sum(0), rtol=2e-5)
 
 
 def evidence_of(rng, candidates, noisy, gain=1.0):

@@ -14,7 +14,7 @@ from jaxdn import color
 from jaxdn.denoiser import Params
 from jaxdn.filters.kalman import box_sum
 from jaxdn.methods.combiner.candidates import CANDIDATES
-from jaxdn.ops.scales import add_planes, crop, halve_planes, join_pixels, join_planes
+from jaxdn.ops.scales import add_planes, crop, halve_planes, join_pixels, to_planes, upsample
 
 RADII = (1, 3)
 """Of the windows over which the slopes are measured, in blocks of 2x2 pixels."""
@@ -91,11 +91,15 @@ def assemble_evidence(
 def begin(params: Params) -> Params:
     """The network's parameters before training, from those that were drawn: the shares of :data:`INITIAL_LOGITS`."""
     logits = jnp.asarray([INITIAL_LOGITS[name] for name in CANDIDATES], jnp.float32)
-    head = {"kernel": _SMALL * params["head_0"]["kernel"], "bias": jnp.repeat(logits, 4)}
+    head = {"kernel": _SMALL * params["head_0"]["kernel"], "bias": logits}
     return {**params, "head_0": head}
 
 
 def split_shares(head: jax.Array, size: tuple[int, int]) -> jax.Array:
-    """[4, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 16]."""
-    own = crop(head, (size[0] // 2, size[1] // 2))
-    return jax.nn.softmax(join_planes([("blocks", own)]), axis=0)
+    """[4, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 4].
+
+    Blocks of 2x2 pixels have one logit a candidate, enlarged: where candidates differ much, as in a shadow that moves,
+    shares that each pixel of a block has of its own show as a grid.
+    """
+    logits = upsample(crop(head, (size[0] // 2, size[1] // 2)))
+    return jax.nn.softmax(to_planes(logits), axis=0)

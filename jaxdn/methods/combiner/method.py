@@ -228,12 +228,12 @@ def build_chooser(options: Options) -> "Network":
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
-    widths, heads = CHOICE_WIDTHS[_quality(options)], (4 * len(CANDIDATES),)
+    widths, heads = CHOICE_WIDTHS[_quality(options)], (len(CANDIDATES),)
     return unet(choice.count_inputs(), heads, widths=widths, head_size=1, implementation=options.implementation)
 
 
 def _chooser_shape(options: Options) -> graph.GraphSpec:
-    return graph.unet(1, (4 * len(CANDIDATES),), widths=CHOICE_WIDTHS[_quality(options)], head_size=1)
+    return graph.unet(1, (len(CANDIDATES),), widths=CHOICE_WIDTHS[_quality(options)], head_size=1)
 
 
 def _priors(options: Options) -> list[Denoiser]:
