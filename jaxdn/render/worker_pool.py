@@ -19,12 +19,9 @@ from jaxdn.render.clip_job import ClipJob, UnplannedClip, describe_death, is_fin
 from jaxdn.render.executor import render_by_executor
 from jaxdn.render.frame_counter import open_counter
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.render.mitsuba.variant import choose_variant
+from jaxdn.render.mitsuba.variant import LEAST_THREADS, choose_variant
 from jaxdn.runtime.cores import count_cores
 from jaxdn.runtime.parent import end_with_parent
-
-_THREADS = 2
-"""Renderer threads of each process. With only one, Mitsuba's loader waits forever for some scenes' textures."""
 
 
 class _Worker(NamedTuple):
@@ -65,7 +62,7 @@ def render_clips(
     folders = [job.folder for job in waiting]
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
         raise ValueError("render_clips: expected a different folder for every clip.")
-    check_at_least(2, threads=_THREADS if threads is None else threads)
+    check_at_least(LEAST_THREADS, threads=LEAST_THREADS if threads is None else threads)
     check_at_least(1, workers=1 if workers is None else workers)
     if executor is None and frames_per_task is not None:
         raise ValueError("frames_per_task: expected none without an executor; leave it out, or pass an executor.")
@@ -74,7 +71,7 @@ def render_clips(
     if executor is not None:
         check_at_least(1, frames_per_task=1 if frames_per_task is None else frames_per_task)
         failures = render_by_executor(
-            executor, waiting, threads=threads or _THREADS, frames_per_task=frames_per_task, progress=progress
+            executor, waiting, threads=threads or LEAST_THREADS, frames_per_task=frames_per_task, progress=progress
         )
     else:
         planned = [job.plan() if isinstance(job, UnplannedClip) else job for job in waiting]
@@ -91,7 +88,7 @@ def _render_here(
     total = sum(job.frames for job in jobs)
     waiting = [job for job in map(keep_variant, jobs) if not is_finished(job)]
     limit = max(1, min(workers or count_cores(), len(waiting)))
-    threads = threads or (_THREADS if limit > 1 else 0)
+    threads = threads or (LEAST_THREADS if limit > 1 else 0)
     for job in waiting:
         try:
             choose_variant(job.settings.variant)  # probed once, here: the processes inherit the result

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from jaxdn.data.exr.exr import write_exr
 from jaxdn.render.scenes.animation import RigidKeys, make_rotation, slerp
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
@@ -312,6 +313,26 @@ def test_a_scene_opens_before_a_variant_was_chosen(tmp_path):
     )
     code = f"from jaxdn.render.scenes.scene_file import SceneFile; print(SceneFile({str(path)!r}).frames)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "1", done.stderr
+
+
+def test_a_picture_of_light_is_read_on_one_core(tmp_path):
+    """Mitsuba reads EXR files by threads besides its own, of which there are none on one core: it waited for ever."""
+    sky = np.random.default_rng(0).uniform(0, 1, (64, 128)).astype(np.float32)
+    write_exr(tmp_path / "sky.exr", dict.fromkeys("RGB", sky))
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="40"/></sensor>'
+        '<shape type="sphere" id="ball"/>'
+        '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+    )
+    code = f"""
+import os
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from jaxdn.render.scenes.scene_file import SceneFile
+print(len(SceneFile({str(path)!r}).build(0, 8, 6).emitters()))"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100)
     assert done.stdout.strip() == "1", done.stderr
 
 

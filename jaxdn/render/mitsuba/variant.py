@@ -21,6 +21,8 @@ OVERRIDE = "JAXDN_VARIANT"
 _LIBRARY = "DRJIT_LIBLLVM_PATH"
 _FOUND = "_JAXDN_VARIANT_FOUND"
 _OLDEST_LLVM = 17
+LEAST_THREADS = 2
+"""Of the renderer, in each process. With one, Mitsuba's loader waits for ever for the pictures of some scenes."""
 
 _PROBE = """
 import sys
@@ -154,11 +156,17 @@ def _check_name(variant: str) -> None:
 
 
 def use_variant(requested: str | None = None) -> str:
-    """Switch this thread to the variant of :func:`choose_variant` and return its name."""
+    """Switch this thread to the variant of :func:`choose_variant` and return its name.
+
+    On one core the process gets :data:`LEAST_THREADS` threads.
+    """
     choice = choose_variant(requested)
     if choice.llvm:
         os.environ[_LIBRARY] = choice.llvm
     mitsuba: Any = importlib.import_module("mitsuba")
     if mitsuba.variant() != choice.variant:
         mitsuba.set_variant(choice.variant)
+    drjit: Any = importlib.import_module("drjit")
+    if drjit.thread_count() < LEAST_THREADS:
+        drjit.set_thread_count(LEAST_THREADS)
     return choice.variant
