@@ -51,9 +51,10 @@ def take_over(steady: Params) -> Params:
     old, wide = first["kernel"].shape[2], jnp.zeros_like(widened["kernel"])
     kernel = wide.at[:, :, :old].set(first["kernel"])
     params["encoder_0"] = {**steady["encoder_0"], "convolution_0": {**first, "kernel": kernel}}
-    # Features of four pixels, trust and the share of the new frame are the first of what steady's network says.
+    # Features, trust and the share of the new frame are the first of what steady's network says, of four pixels each.
     channels = new["head_0"]["bias"].size
-    params["head_0"] = {leaf: each[..., :channels] for leaf, each in steady["head_0"].items()}
+    for leaf, each in steady["head_0"].items():
+        params["head_0"][leaf] = each[..., : 4 * channels].reshape(*each.shape[:-1], channels, 4).mean(-1)
     return params
 
 

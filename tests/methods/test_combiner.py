@@ -23,7 +23,7 @@ from jaxdn.methods.combiner.history import (
     start_history,
     update_means,
 )
-from jaxdn.methods.combiner.method import FEATURES, INITIAL, prepare
+from jaxdn.methods.combiner.method import FEATURES, INITIAL, prepare, split_head
 from jaxdn.zoo.weights import load_weights, save_weights
 from tests.needs import require
 
@@ -65,7 +65,7 @@ def deciding(weights_of_candidates, follow=0.0):
     params = untrained()
     logits = {**dict.fromkeys(CANDIDATES, -1e3), **weights_of_candidates}
     bias = np.array(params["head_0"]["bias"])
-    bias[4 * FEATURES : 4 * (FEATURES + len(INITIAL))] = np.repeat([4.0, follow], 4)
+    bias[FEATURES:] = [4.0, follow]
     head = {"kernel": jnp.zeros_like(params["head_0"]["kernel"]), "bias": jnp.asarray(bias)}
     shares = {
         "kernel": jnp.zeros_like(params["choice"]["head_0"]["kernel"]),
@@ -161,7 +161,7 @@ def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
 
 
 def candidates_of(means, prior, last):
-    parameters = FilterParameters(jnp.zeros((8, 10, 20)), jnp.ones((16, 20)))
+    parameters = FilterParameters(jnp.zeros((FEATURES, 16, 20)), jnp.ones((16, 20)))
     precisions = {name: jnp.full(1, -9.0) for name in ("albedo", "normal", "light", "depth", "learned")}
     statistics, _ = jax.jit(prepare)(Frame(jnp.ones((16, 20, 3))))
     found = jax.jit(make_candidates)(precisions, means, prior, last, None, parameters, statistics)
@@ -286,23 +286,42 @@ def test_the_first_weights_take_over_what_steady_knows():
     kernel = np.asarray(params["encoder_0"]["convolution_0"]["kernel"])
     np.testing.assert_array_equal(kernel[:, :, :52], steady["encoder_0"]["convolution_0"]["kernel"])
     assert not kernel[:, :, 52:].any()
-    np.testing.assert_array_equal(params["head_0"]["bias"], steady["head_0"]["bias"][:28])
+    of_blocks = np.reshape(steady["head_0"]["bias"][:28], (7, 4)).mean(1)
+    np.testing.assert_allclose(params["head_0"]["bias"], of_blocks, rtol=1e-5)
     jax.tree.map(np.testing.assert_array_equal, params["choice"], like["choice"])
     np.testing.assert_array_equal(params["guide"]["albedo"], steady["guide"]["albedo"][:1])
+
+
+def enlarge(blocks):
+    """[h, w, C] at twice the size, linear between the centres of blocks, in float64."""
+
+    def along(lines):
+        centres = np.arange(len(lines)) + 0.5
+        return np.stack([np.interp(np.arange(0.25, len(lines), 0.5), centres, line) for line in lines.T], axis=1)
+
+    tall = np.stack([along(column) for column in blocks.transpose(1, 0, 2)], axis=1)
+    return np.stack([along(row) for row in tall])
 
 
 def test_shares_are_those_of_blocks_enlarged(rng):
     """Pixels of a block have none of their own: where candidates differ much, those showed as a grid."""
     logits = rng.normal(0, 2, (5, 8, len(CANDIDATES)))  # padded by a row and two columns
     found = split_shares(jnp.asarray(logits, jnp.float32), (8, 12))
-
-    def enlarge(lines):
-        blocks = np.arange(len(lines)) + 0.5
-        return np.stack([np.interp(np.arange(0.25, len(lines), 0.5), blocks, line) for line in lines.T], axis=1)
-
-    tall = np.stack([enlarge(logits[:4, column]) for column in range(6)], axis=1)
-    expected = np.exp(np.stack([enlarge(row) for row in tall])).transpose(2, 0, 1)
+    expected = np.exp(enlarge(logits[:4, :6])).transpose(2, 0, 1)
     np.testing.assert_allclose(found, expected / expected.sum(0), rtol=2e-5)
+
+
+def test_parameters_of_the_filter_are_those_of_blocks_enlarged(rng):
+    """Of features that pixels of a block have each of their own, the filter makes a weave."""
+    head = rng.normal(0, 2, (5, 8, FEATURES + len(INITIAL)))
+    parameters, follow = split_head(jnp.asarray(head, jnp.float32), (8, 12))
+    own = head[:4, :6]
+    features = enlarge(own[..., :FEATURES]).transpose(2, 0, 1)
+    np.testing.assert_allclose(parameters.features, features, rtol=1e-5, atol=1e-6)
+    trust = 1.0 / (1.0 + np.exp(-enlarge(own[..., FEATURES : FEATURES + 1])[..., 0]))
+    np.testing.assert_allclose(parameters.trust, trust, rtol=1e-5)
+    shares = enlarge(1.0 / (1.0 + np.exp(-own[..., FEATURES + 1 :])))[..., 0]
+    np.testing.assert_allclose(follow, shares, rtol=1e-5)
 
 
 def evidence_of(rng, candidates, noisy, gain=1.0):

@@ -17,7 +17,6 @@ from jaxdn.filters import affinity_levels
 from jaxdn.filters.affinity_levels import LEAST_TRUST, compute_inverse_depth, scale_guide
 from jaxdn.methods.combiner.history import Means
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
-from jaxdn.ops.scales import join_planes
 
 CANDIDATES = ("prior", "correction", "prior mean", "last result")
 """In the order of their weights."""
@@ -31,7 +30,7 @@ class FilterParameters(NamedTuple):
     """What a network decides about the filter."""
 
     features: jax.Array
-    """[H/2, W/2, 4F] of all four pixels of a block (:func:`jaxdn.ops.scales.space_to_depth`)."""
+    """[F, H, W]."""
     trust: jax.Array
     """[H, W] in [0, 1]."""
 
@@ -54,8 +53,7 @@ def make_candidates(
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
     inverse_depth = jnp.zeros_like(means.light) if depth is None else compute_inverse_depth(depth, statistics)
     seen = color.compress(statistics.exposure * means.prior)
-    surfaces = jnp.concatenate([means.albedo, means.normal, seen])
-    features = join_planes([("planes", surfaces), ("blocks", parameters.features)])
+    features = jnp.concatenate([means.albedo, means.normal, seen, parameters.features])
     guide = scale_guide(Guide(features, inverse_depth, parameters.trust + LEAST_TRUST), factors, 0, GUIDES)
     filtered = jnp.concatenate([means.light, means.prior])
     for index in range(LEVELS):

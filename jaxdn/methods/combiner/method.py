@@ -49,7 +49,7 @@ from jaxdn.methods.oidn import oidn
 from jaxdn.methods.registry import method
 from jaxdn.networks import Widths, graph
 from jaxdn.ops import oidn as binding
-from jaxdn.ops.scales import crop, downsample, fill_holes, join_pixels, join_planes, pad, to_planes, upsample
+from jaxdn.ops.scales import crop, fill_holes, join_pixels, pad, to_planes, upsample
 from jaxdn.recipes.augmentation import Augmentation
 from jaxdn.recipes.objectives import squared_illumination
 from jaxdn.recipes.recipe import Recipe
@@ -62,9 +62,9 @@ WIDTHS: dict[str, Widths] = {
 CHOICE_WIDTHS: dict[str, Widths] = {"high": ((32,),) * 5, "fast": ((16,),) * 5}
 """Channels of the second network."""
 FEATURES = 5
-"""Learned features of a pixel."""
+"""Learned features."""
 INITIAL = {"trust": 4.0, "follow": 0.0}
-"""Parameters of every pixel, one logit each, and what they are before training: how far its light is trusted; the
+"""What else is decided everywhere, one logit each, and what they are before training: how far its light is trusted; the
 share of the new frame in the means."""
 PRECISIONS = {"albedo": 1.0, "normal": 1.0, "light": 4.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
@@ -145,9 +145,9 @@ def combiner(options: Options) -> Denoiser:
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
         chosen = choice.begin(chooser.init(jax.random.fold_in(key, 1)))
-        pixel = [0.0] * FEATURES + list(INITIAL.values())
+        block = [0.0] * FEATURES + list(INITIAL.values())
         precisions = {name: jnp.full((1,), value, jnp.float32) for name, value in PRECISIONS.items()}
-        head = {**params["head_0"], "bias": jnp.repeat(jnp.asarray(pixel, jnp.float32), 4)}
+        head = {**params["head_0"], "bias": jnp.asarray(block, jnp.float32)}
         return {**params, "head_0": head, "guide": precisions, "choice": chosen}
 
     def start(params: Params, frame: Frame) -> CombinerState:
@@ -203,7 +203,7 @@ def build_candidate_step(options: Options) -> CandidateStep:
         weights = {name: part for name, part in params.items() if name not in ("guide", "choice")}
         inputs = _assemble_network_input(frame, now, past, statistics)
         head = network.apply(weights, [group[None] for group in inputs])[0][0]
-        parameters, follow = _split_head(head, tuple(side + -side % _BLOCKS for side in size))
+        parameters, follow = split_head(head, tuple(side + -side % _BLOCKS for side in size))
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
         wide = pad_planes(means)
@@ -249,7 +249,7 @@ def _build_network(options: Options) -> tuple["Network", graph.GraphSpec]:
     from jaxdn.networks.unet import unet
 
     widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
-    heads = (4 * (FEATURES + len(INITIAL)),)
+    heads = (FEATURES + len(INITIAL),)
     groups = tuple(INPUTS.values())
     network = unet(groups, heads, widths=widths, head_size=1, implementation=options.implementation)
     return network, graph.unet(1, heads, widths=widths, head_size=1)
@@ -299,15 +299,17 @@ def _assemble_network_input(
     return join([], geometry), join(means[0], levels[0]), join(means[1], levels[1])
 
 
-def _split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters, jax.Array]:
-    """Of the first network's output: the filter's parameters, and the share [H, W] of the new frame."""
-    height, width = size[0] // 2, size[1] // 2
-    own, logits = jnp.split(crop(head, (height, width)), [4 * FEATURES], axis=-1)
-    planes = join_planes([("blocks", logits)])
-    trust, follow = jax.nn.sigmoid(planes[0]), jax.nn.sigmoid(planes[1])
-    # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
-    follow = upsample(downsample(follow[..., None]))[..., 0]
-    return FilterParameters(own, trust), follow
+def split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters, jax.Array]:
+    """Of the first network's output: the filter's parameters, and the share [H, W] of the new frame.
+
+    All are those of blocks of 2x2 pixels, enlarged. Features and a trust that each pixel of a block has of its own make
+    the filter prefer every other pixel, and what it finds a weave. A pixel whose share knows of its own noise, follows
+    bright samples more: its mean becomes too bright.
+    """
+    blocks = crop(head, (size[0] // 2, size[1] // 2))
+    planes = to_planes(upsample(blocks[..., : FEATURES + 1]))
+    follow = upsample(jax.nn.sigmoid(blocks[..., FEATURES + 1 :]))[..., 0]
+    return FilterParameters(planes[:FEATURES], jax.nn.sigmoid(planes[FEATURES])), follow
 
 
 def _mix(shares: jax.Array, candidates: list[jax.Array], gain: jax.Array) -> jax.Array:
