@@ -24,14 +24,14 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 BEGIN, END = "<!-- results: written by make results -->", "<!-- /results -->"
 OIDN = "Open Image Denoise high"
-ENGINES = {
+BACKEND_COLUMNS = {
     "onednn-bfloat16": "oneDNN, bfloat16",
     "onednn-float32": "oneDNN, float32",
     "xla": "XLA",
     "onnxruntime": "ONNX Runtime",
     "reference": "XLA, no Numba kernels",
 }
-"""Engine in the rows of ``frames`` -> column."""
+"""Backend in the rows of ``frames`` -> column."""
 PEERS = {
     "torch-compiled": "of PyTorch compiled",
     "torch-eager": "of PyTorch eager",
@@ -177,27 +177,27 @@ def _is_best(
 
 
 def _frames(result: Result) -> list[str]:
-    """One table for each size: methods by engines, milliseconds, and their ratio to the peer if it ran in that run."""
+    """One table for each size: methods by backends, milliseconds, and their ratio to the peer if that run has it."""
     rows, tables = result["rows"], []
     for width, height in dict.fromkeys((row["width"], row["height"]) for row in rows):
         here = [row for row in rows if (row["width"], row["height"]) == (width, height)]
         reference = {row["run"]: row["ms"] for row in here if row["implementation"] == OIDN}
         times: dict[tuple[str, int], dict[str, float]] = {}
         for row in here:
-            method, _, engine = row["implementation"].partition(", ")
-            if engine:
-                times.setdefault((method, row["run"]), {})[engine] = row["ms"]
-        engines = [engine for engine in ENGINES if any(engine in found for found in times.values())]
+            method, _, backend = row["implementation"].partition(", ")
+            if backend:
+                times.setdefault((method, row["run"]), {})[backend] = row["ms"]
+        backends = [backend for backend in BACKEND_COLUMNS if any(backend in found for found in times.values())]
         lines = [
             [
                 f"`{method}`",
                 str(run),
-                *(_ratio(found.get(engine), reference.get(run)) for engine in engines),
+                *(_ratio(found.get(backend), reference.get(run)) for backend in backends),
                 _ms(reference[run]) if run in reference else "",
             ]
             for (method, run), found in times.items()
         ]
-        head = [f"{width} x {height}", "run", *(ENGINES[engine] for engine in engines), OIDN]
+        head = [f"{width} x {height}", "run", *(BACKEND_COLUMNS[backend] for backend in backends), OIDN]
         tables.append(_markdown(head, lines))
     return tables
 

@@ -233,7 +233,7 @@ class Train:
     process: int | None = None
     """With --coordinator: which of them this is, from 0."""
     implementation: str = "auto"
-    """Engine for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
+    """Backend for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 
 
 @dataclass
@@ -306,7 +306,7 @@ class Denoise:
     view: str | None = None
     """For files of other renderers with several views (stereo): the only one to read; default: every view."""
     implementation: str = "auto"
-    """Engine for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
+    """Backend for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
     onednn-float32 (CPUs; the extra onednn), onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
     budget: float | None = None
     """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean; default: the

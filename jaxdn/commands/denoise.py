@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxdn.commands.arguments import Denoise, check_folder, make_channel_naming
 from jaxdn.commands.channel_table import show_channel_mapping
-from jaxdn.commands.errors import engine_errors
+from jaxdn.commands.errors import computing_errors
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import make, numbers, parse
 from jaxdn.data.clip.folder import is_clip, read_record
@@ -41,7 +41,7 @@ def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None
     if options.method == AUTO:
         options = _choose_method(options, of_scene=scene is not None)
     less = "--max-memory" if scene is None else "a smaller --width and --height"
-    with engine_errors(f"{less}, or another --method"):
+    with computing_errors(f"{less}, or another --method"):
         if scene is None:
             _denoise_files(options, naming, on_start)
         else:

@@ -60,7 +60,7 @@ def plain_errors() -> Iterator[None]:
 
 
 @contextmanager
-def engine_errors(remedy: str) -> Iterator[None]:
+def computing_errors(remedy: str) -> Iterator[None]:
     """Raise ValueError, with what to change, for full memory and for a failure of Open Image Denoise.
 
     ``remedy`` names the options by which a command needs less memory, or another method. XLA raises RuntimeError for

@@ -23,7 +23,7 @@ from jaxdn.commands.arguments import (
     check_folder,
     make_channel_naming,
 )
-from jaxdn.commands.errors import end_with_reader, engine_errors, plain_errors
+from jaxdn.commands.errors import computing_errors, end_with_reader, plain_errors
 from jaxdn.runtime.garbage import put_off_collection
 from jaxdn.runtime.interrupt import exit_on_interrupt
 from jaxdn.runtime.program_cache import keep_programs
@@ -122,13 +122,13 @@ def _train(options: Train) -> None:
     if not options.distributed:
         if any(value is not None for value in given):
             raise ValueError("--coordinator, --processes, --process: expected --distributed too; give it, or none.")
-        with engine_errors(_LESS_TO_TRAIN):
+        with computing_errors(_LESS_TO_TRAIN):
             _train_here(options)
         return
     from jaxdn.commands.distributed import Place, join_processes
 
     # Outside: which of jax's own errors it is tells whether another process is lost.
-    with engine_errors(_LESS_TO_TRAIN), join_processes(Place(*given)):
+    with computing_errors(_LESS_TO_TRAIN), join_processes(Place(*given)):
         _train_here(options)
 
 
@@ -185,7 +185,7 @@ def _compare(options: Compare) -> None:
     folders = find_clips(options.clips)
     settings = {"clips": len(folders), "spp": options.spp, "methods": names}
     title = f"Denoisers on {options.clips.name}"
-    with engine_errors("other --methods, or smaller clips"):
+    with computing_errors("other --methods, or smaller clips"):
         results = compare(methods, folders, title=title, settings=settings, spp=options.spp)
     page = write_report(results, out)
     print(text_table(results))

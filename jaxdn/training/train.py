@@ -72,11 +72,11 @@ def train(
     label = out.name if label is None else label
     backend = method.backend("training") if implementation == "auto" else implementation
     if backend not in (None, "reference"):
-        denoiser, engine = method.factory(**{**options, "implementation": backend}), f"convolutions run on {backend}"
+        denoiser, computes = method.factory(**{**options, "implementation": backend}), f"convolutions run on {backend}"
     else:
-        denoiser, engine = method.factory(**options), "everything runs on XLA"
+        denoiser, computes = method.factory(**options), "everything runs on XLA"
     if writes():
-        print(f"{label}: {engine}", flush=True)
+        print(f"{label}: {computes}", flush=True)
     batches = recipe_batches(denoiser, recipe, clips)
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp)) if writes() else []
     first = None

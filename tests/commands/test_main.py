@@ -178,19 +178,19 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path, capsys):
         pixels = {letter: rng.exponential(size=(33, 57)).astype(np.float32) for letter in "RGB"}
         pixels["R"][3, 4], pixels["G"][5, 6], pixels["B"][7, 8] = np.nan, np.inf, -3.0
         write_shot(tmp_path / f"shot_{index:04d}.exr", pixels)
-    engines = ["reference", *(["onnxruntime"] if find_spec("onnxruntime") else [])]
+    backends = ["reference", *(["onnxruntime"] if find_spec("onnxruntime") else [])]
     reds = []
-    for engine in engines:
-        out = tmp_path / engine
-        command = ["denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", engine]
-        if engine == "reference":
+    for backend in backends:
+        out = tmp_path / backend
+        command = ["denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", backend]
+        if backend == "reference":
             done = jaxdn(*command)
             assert done.returncode == 0, done.stderr
             said = done.stdout
         else:  # here, as a process takes longer to begin than to do this
             run_here(*command)
             said = capsys.readouterr().out
-        assert f"({engine}, 1 program compiled)" in said
+        assert f"({backend}, 1 program compiled)" in said
         assert "4 values sanitized: not usable numbers" in said  # negative light is usable: it comes back
         with OpenEXR.File(str(out / "shot_0001.exr"), separate_channels=True) as file:
             reds.append(file.channels()["R"].pixels)

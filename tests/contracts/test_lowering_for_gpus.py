@@ -21,7 +21,7 @@ KERNELS = "__gpu$xla.gpu.triton"
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_step_is_lowered_for_cuda(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It calls nothing of the CPU's: neither compiled loops nor engines, which have no GPU's form."""
+    """It calls nothing of the CPU's: neither compiled loops nor backends, which have no GPU's form."""
     model, size = find_model(name), (64, 96)
     assert model.denoiser is not None
     frame = only_read(model, frame_of(*size))

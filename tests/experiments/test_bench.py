@@ -63,7 +63,7 @@ def test_peak_memory_is_what_a_call_touches():
 NAP = partial(partial, time.sleep, 0.02)
 END = partial(partial, signal.raise_signal, signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL)
 """The call ends its process, as the system does when memory runs out."""
-REFUSE = partial(int, "such an engine")
+REFUSE = partial(int, "such a backend")
 
 
 def state_of(pid):
@@ -144,7 +144,7 @@ def test_what_fails_is_said_and_the_rest_goes_on(tmp_path):
         assert len(samples["good"]) == 3
         peak = team.peak("good", None)
         assert peak is None or 0 <= peak < 50
-    assert said[0] == "work: bad is left out: invalid literal for int() with base 10: 'such an engine'"
+    assert said[0] == "work: bad is left out: invalid literal for int() with base 10: 'such a backend'"
     assert said[1] == "work: dead is left out: its process ended, perhaps for want of memory"
     assert said[2].startswith("work: brief is left out: FileNotFoundError: ")
     assert len(said) == 3
@@ -221,10 +221,10 @@ def test_every_implementation_is_compared_with_every_peer():
 @pytest.mark.slow
 def test_without_ceilings_there_are_no_rows_of_the_roofline():
     said = []
-    work = Work("nothing", {"xla": NAP, "engine": REFUSE}, {"peer": NAP}, [roofline.Cost(1e6, 1e6)])
+    work = Work("nothing", {"xla": NAP, "backend": REFUSE}, {"peer": NAP}, [roofline.Cost(1e6, 1e6)])
     rows = bench.run(work, {**PROBES, "copy": roofline.Probe(END, 1, 0)}, budget_s=0.1, say=said.append)
     assert [(row["implementation"], row["against"]) for row in rows] == [("xla", "peer")]
-    assert any(line.startswith("nothing: engine is left out: invalid literal") for line in said)
+    assert any(line.startswith("nothing: backend is left out: invalid literal") for line in said)
     assert any(line.startswith("nothing: copy is left out: its process ended") for line in said)
 
 

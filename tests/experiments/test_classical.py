@@ -15,7 +15,7 @@ WEIGHTS, FILTER = "ntd-small", "taa"
 @pytest.mark.usefixtures("plain_processes")
 def test_filters_are_scored_and_timed(tmp_path, capsys, monkeypatch):
     # One of the shipped weights and the filter that is compiled soonest stand for all: each is compiled for the images
-    # and for its time. The weights are timed on another engine, and compared with the filter.
+    # and for its time. The weights are timed on another backend, and compared with the filter.
     monkeypatch.setattr(classical, "shipped_names", lambda: [WEIGHTS])
     monkeypatch.setattr(classical, "filter_names", lambda: [FILTER])
     monkeypatch.setattr(classical, "AGAINST", FILTER)

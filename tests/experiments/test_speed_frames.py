@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.results_page import ENGINES, read_results, results_page
+from experiments.results_page import BACKEND_COLUMNS, read_results, results_page
 from experiments.speed.frames import OIDN, Settings, builds, main, measurement, parsed
 from jaxdn.networks.backends import BACKENDS
 from jaxdn.ops.dispatch import numba_call
@@ -16,7 +16,9 @@ def test_every_engine_for_inference_that_runs_here_is_timed():
     methods = ("svgf", "steady-fast")
     without = [f"{name}, reference" for name in methods if not numba_call.unavailable()]
     assert found == {*(f"{name}, xla" for name in methods), *without, *(f"steady-fast, {name}" for name in backends)}
-    assert {label.partition(", ")[2] for label in found} <= ENGINES.keys(), "each has its column on the page of results"
+    assert {label.partition(", ")[2] for label in found} <= BACKEND_COLUMNS.keys(), (
+        "each has its column on the page of results"
+    )
 
 
 def test_the_page_of_results_reads_what_is_saved(tmp_path):

@@ -68,8 +68,8 @@ class Stopping:
         self.source.set_state(state)
 
 
-def run_on(engine, clips, folder, *, source=None, checkpoint_every):
-    denoiser, every = ntd(size=TINY, **PLAIN, implementation=engine), Every(1, checkpoint=checkpoint_every)
+def run_on(backend, clips, folder, *, source=None, checkpoint_every):
+    denoiser, every = ntd(size=TINY, **PLAIN, implementation=backend), Every(1, checkpoint=checkpoint_every)
     return fit(denoiser, RECIPE, source or batches(clips), folder, label="t", every=every)
 
 
