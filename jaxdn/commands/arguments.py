@@ -259,9 +259,9 @@ class Denoise:
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "auto"
     """Shipped weights (combiner-best, combiner-high, ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast,
-    steady-high, svgf-fitted), a filter (svgf, asvgf, taa, oidn), the path of a .safetensors file, or a filter of
-    another package (package.module:name); an unknown name lists all. auto: on other renderers' files and jaxdn's own
-    clips with filtered pixels combiner-high, if the extra oidn is installed; else, and on all other clips,
+    steady-high, svgf-fitted), a method without weights (svgf, asvgf, taa, oidn), the path of a .safetensors file, or
+    a method of another package (package.module:name); an unknown name lists all. auto: on other renderers' files and
+    jaxdn's own clips with filtered pixels combiner-high, if the extra oidn is installed; else, and on all other clips,
     steady-balanced."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
@@ -335,7 +335,7 @@ class Compare:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
     methods: list[str] = field(default_factory=list)
-    """noisy, filters (also of other packages, as package.module:name), shipped weights or .safetensors files; default:
+    """noisy, methods (also of other packages, as package.module:name), shipped weights or .safetensors files; default:
     all that come with the package."""
     spp: int = 1
     """Samples per pixel to take from the clips' layers."""
@@ -353,8 +353,8 @@ class Export:
     """
 
     method: tyro.conf.Positional[str]
-    """A filter (svgf, taa), shipped weights (steady-balanced, ntd-large), the path of a .safetensors file, or a filter
-    of another package (package.module:name)."""
+    """A method without weights (svgf, taa), shipped weights (steady-balanced, ntd-large), the path of a .safetensors
+    file, or a method of another package (package.module:name)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for METHOD.stablehlo and METHOD.onnx."""
     width: int | None = None
@@ -364,7 +364,7 @@ class Export:
     buffers: list[str] | None = None
     """Buffers that the frames will have besides radiance; default: all that the method reads."""
     format: Literal["both", "stablehlo", "onnx"] = "both"
-    """What to write; some filters have operations that are not translated to ONNX."""
+    """What to write; some methods have operations that are not translated to ONNX."""
 
 
 @dataclass
