@@ -38,10 +38,10 @@ class Inspect:
     denoiser: str | None = None
     """Plan for this denoiser (svgf, steady-balanced ...), or several (svgf,relax); default: for every buffer that a
     denoiser may read."""
-    width: int = 128
-    """Width of a scene's frames in pixels."""
-    height: int = 128
-    """Height of a scene's frames in pixels."""
+    width: int | None = None
+    """Width of a scene's frames in pixels; default: 128."""
+    height: int | None = None
+    """Height of a scene's frames in pixels; default: 128."""
     frames: int | None = None
     """Number of frames of a scene or clip to inspect; default: all of the animation."""
     json: bool = False
@@ -268,8 +268,9 @@ class Denoise:
     frames are about as good as the last."""
     safe: bool = True
     """Keep what is not recognised as noise; clean frames come back unchanged."""
-    frames: list[str] = field(default_factory=list)
-    """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
+    frames: list[str] | None = None
+    """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history. Default:
+    all."""
     skip_existing: bool = False
     """Leave out frames whose result is there already."""
     strict: bool = False
@@ -334,7 +335,7 @@ class Compare:
     """Folder of clips, or one clip."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
-    methods: list[str] = field(default_factory=list)
+    methods: list[str] | None = None
     """noisy, methods (also of other packages, as package.module:name), shipped weights or .safetensors files; default:
     all that come with the package."""
     spp: int = 1

@@ -1,5 +1,6 @@
 """``jaxdn denoise``: frames that are there, or a scene that is rendered for the denoiser."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +59,13 @@ def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:
 
 def _denoise_files(options: Denoise, naming: ChannelNaming, on_start: Callable[[], None]) -> None:
     """Frames of clips and of other renderers."""
+    if options.max_memory is not None and not 0 < options.max_memory < math.inf:
+        raise ValueError(f"--max-memory: expected more than 0 GiB, got {options.max_memory:g}.")
+    known = find_model(options.method).method
+    if options.budget is not None and (known is None or not known.has_option("budget")):
+        raise ValueError(
+            f"--budget: expected a method that says where samples go (ntasd, dasr), got {options.method}; leave it out."
+        )
     method, backend = select_backend(options.method, options.implementation, **_budget(options))
     settings = Settings(
         spp=options.spp,
@@ -177,7 +185,7 @@ def _scene_of(options: Denoise) -> str | None:
 
 def _frames(options: Denoise) -> list[int] | None:
     """The numbers of the frames to denoise; None: all."""
-    return numbers(options.frames, "--frames", negative=True) if options.frames else None
+    return None if options.frames is None else numbers(options.frames, "--frames", negative=True)
 
 
 def _budget(options: Denoise) -> dict[str, Any]:

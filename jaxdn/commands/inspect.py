@@ -29,6 +29,8 @@ from jaxdn.sequence.render_jobs import PlannedClip, find_denoiser, plan_clip
 
 EVERYTHING = plan(choose_all_effects(1))
 """The plan that corresponds to rendering everything."""
+_SIDE = 128
+"""Pixels of a side of a scene's frames, if nothing else is asked for."""
 
 
 def inspect_to_terminal(
@@ -36,8 +38,8 @@ def inspect_to_terminal(
     *,
     animation: Path | None,
     denoiser: str | None,
-    width: int,
-    height: int,
+    width: int | None,
+    height: int | None,
     frames: int | None,
     as_json: bool,
     naming: ChannelNaming,
@@ -52,18 +54,23 @@ def inspect_to_terminal(
         of several EXR files.
       animation: animation file for a scene file.
       denoiser: name of the denoiser to plan for; None: for every buffer that a denoiser may read.
-      width: in pixels.
-      height: in pixels.
+      width: of a scene's frames in pixels; None: 128.
+      height: likewise.
       frames: number of frames to inspect; None: all.
       as_json: print only one JSON object.
       naming: what is stated about the channels of other renderers' files.
       overlay: folder for the validation page of such files; None: there is none.
     """
+    if not sources:
+        raise ValueError("expected a scene, a family, a clip, or EXR files to inspect, got none; name one.")
     reader = None if denoiser is None else find_denoiser(denoiser)
     source = sources[0]
     if other := [name for name in sources if len(sources) > 1 and not is_named(Path(name))]:
         raise ValueError(f"{other[0]}: expected one scene, clip, folder or pattern, or several EXR files; name one.")
     clip = is_clip(source)
+    sizes = [name for name, side in (("--width", width), ("--height", height)) if side is not None]
+    if sizes and (clip or len(sources) > 1 or _are_frames(source)):
+        raise ValueError(f"{source}: expected none of {', '.join(sizes)}, as its frames have a size; leave it out.")
     if not clip and (len(sources) > 1 or _are_frames(source)):
         if animation is not None or frames is not None:
             raise ValueError(f"{source}: expected none of --animation, --frames, which are for scenes and own clips.")
@@ -87,6 +94,7 @@ def inspect_to_terminal(
         reads = None if reader is None else reader.reads
         show_channel_mapping(source, read_channel_mapping(source), reads=reads)
     with _nothing_else_on_stdout():
+        height, width = (_SIDE if side is None else side for side in (height, width))
         planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
     if as_json:
         found = planned.effects

@@ -63,6 +63,10 @@ def _render(options: Render) -> None:
         **{field.name: given[field.name] for field in fields(RenderSettings) if field.name in given}
     )
     seeds = numbers(options.seeds, "--seeds")
+    if again := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise ValueError(f"--seeds: expected each seed once, got {again[0]} again; each makes a clip of its own.")
+    if options.threads_per_clip is not None and options.threads_per_clip < 2:
+        raise ValueError(f"--threads-per-clip: expected at least 2, got {options.threads_per_clip}.")
     clips = ClipSource(
         options.scene,
         seeds,
@@ -93,6 +97,8 @@ def _pack(options: Pack) -> None:
     from jaxdn.data.training.windows import USUAL, Packing
 
     usual = USUAL if options.format == "file" else tuple(GUIDES)
+    if options.seed < 0:
+        raise ValueError(f"--seed: expected a whole number >= 0, got {options.seed}.")
     packing = Packing(
         crop=options.crop,
         frames=options.frames,
@@ -180,6 +186,8 @@ def _compare(options: Compare) -> None:
     from jaxdn.evaluation.report import text_table, write_report
     from jaxdn.zoo.ready import all_names, find_model
 
+    if options.methods == []:
+        raise ValueError("--methods: expected at least one, got none; name some, or leave --methods out for all.")
     out, names = check_folder(options.out), options.methods or all_names()
     methods = [find_model(name) for name in names]
     folders = find_clips(options.clips)

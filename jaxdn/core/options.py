@@ -65,6 +65,10 @@ def numbers(words: list[str], option: str, *, negative: bool = False) -> list[in
     With ``negative``, numbers may be below 0: -3, -3-2, -3--1.
     """
     minus, least = ("-?", "") if negative else ("", " >= 0")
+    if not words:
+        raise ValueError(
+            f"{option}: expected whole numbers{least} or ranges such as 0-49, got none; leave {option} out."
+        )
     found: list[int] = []
     for word in words:
         match = re.fullmatch(rf"({minus}[0-9]+)(?:-({minus}[0-9]+))?", word)
@@ -83,13 +87,15 @@ def parse(assignments: Sequence[str], *, option: str = "--set", words: bool = Fa
     """``["size=small", "levels=3"]`` as a dict: values are parsed as JSON if possible, else taken as strings.
 
     With ``words`` every value is a string, whatever it looks like. Raises ValueError, naming the command line's
-    ``option``, for what is not ``name=value``.
+    ``option``, for what is not ``name=value`` and for a name that is there twice.
     """
     parsed: dict[str, Any] = {}
     for assignment in assignments:
         name, sign, text = assignment.partition("=")
         if not (name and sign):
             raise ValueError(f"{option} {assignment!r}: expected name=value.")
+        if name in parsed:
+            raise ValueError(f"{option}: expected {name} once, got it twice; leave one out.")
         try:
             parsed[name] = text if words else json.loads(text)
         except ValueError:

@@ -55,6 +55,15 @@ def open_frames(
     return files, map(StoredFrame, plain)
 
 
+def _refuse_naming(path: str | Path, given: Mapping[str, Any]) -> None:
+    """Raise ClipError for what is for files of other renderers, given for a clip of ours."""
+    if unused := [name for name, value in given.items() if value]:
+        raise ClipError(
+            f"{path}: expected none of {', '.join(unused)}, which are for files of other renderers; it is a clip of "
+            "jaxdn's own."
+        )
+
+
 def check_single_layer(path: str | Path | Sequence[Path], spp: int) -> None:
     """Raise ClipError for another renderer's files of which other than their only sample count is asked for."""
     if spp != 1:
@@ -90,10 +99,18 @@ def read_clip(
     :func:`jaxdn.data.foreign.import_exr.plain_frames`).
 
     Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
-    or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available.
+    or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available,
+    and of a clip of ours what is for files of other renderers.
     """
-    naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
-    _, opened = open_frames(path, spp=spp, view=view, **naming)
+    naming: dict[str, Any] = {
+        "motion_convention": motion_convention,
+        "channels": channels,
+        "layer": layer,
+        "view": view,
+    }
+    if is_clip(path):
+        _refuse_naming(path, naming)
+    _, opened = open_frames(path, spp=spp, **naming)
     stored = list(opened)
     counts = doubling_layers(stored[0].layers, path) if layers else []
     named = {name for one in stored for name in present(one.frame)}

@@ -146,6 +146,10 @@ def find_jobs(
     if single and count > 1:
         raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
     _check_folder(out.parent if single else out)
+    if single and out.is_dir():
+        raise ValueError(
+            f"-o {out}: expected the name of an EXR file, but there is a folder of that name; name another."
+        )
     jobs: list[Job] = []
     named = frames is None
     for shot, clip in found:
@@ -157,7 +161,7 @@ def find_jobs(
             for index in range(len(targets))
             if frames is None or set(map(math.floor, shot.numbers[index : index + 1])) & set(frames)
         ]
-        wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
+        wanted = frozenset(index for index in chosen if not (skip_existing and _is_written(targets[index])))
         named |= bool(chosen) or not set(find_missing(shot.numbers)).isdisjoint(frames or ())
         notes = (
             *(joints if not jobs else ()),
@@ -189,6 +193,11 @@ def _gather(sources: Sequence[Path]) -> list[Path | list[Path]]:
             gathered.append(files)
         files.append(source)
     return gathered
+
+
+def _is_written(path: Path) -> bool:
+    """Whether a result is there; a placeholder without bytes is none."""
+    return path.is_file() and path.stat().st_size > 0
 
 
 def _as_exr(path: Path) -> Path:

@@ -47,7 +47,11 @@ def select_backend(name: str, implementation: str = "auto", **options: Any) -> t
         if backend is None:
             return found, "reference"
         return find_model(name, implementation=backend, **options), backend
-    if implementation == "reference" and not known:
+    if not known:
+        if implementation != "reference":
+            raise ValueError(
+                f"implementation: expected auto or reference for {name}, which has no choice, got {implementation!r}."
+            )
         return found, implementation
     return find_model(name, implementation=implementation, **options), implementation
 
@@ -285,7 +289,7 @@ def _once(log: Callable[[str], None]) -> Callable[[str], None]:
 
 
 def _refuse_unused(jobs: Sequence[Job], settings: Settings) -> None:
-    """Raise ValueError for settings that are for files of other renderers where there are only clips of ours."""
+    """Raise ValueError for settings that are for files of other renderers where there is a clip of ours."""
     others = {
         "--aovs": settings.aovs != "keep",
         "--only-beauty": settings.only_beauty,
@@ -294,8 +298,10 @@ def _refuse_unused(jobs: Sequence[Job], settings: Settings) -> None:
         "--reblur": settings.reblur is not None,
     }
     unused = [*settings.naming.options, *(option for option, given in others.items() if given)]
-    if unused and all(job.clip is not None for job in jobs):
+    ours = next((job.clip for job in jobs if job.clip is not None), None)
+    mixed = any(job.clip is None for job in jobs)
+    if unused and ours is not None:
         raise ValueError(
-            f"{', '.join(unused)}: expected files of other renderers, got {jobs[0].clip}, a clip of jaxdn's own; "
-            f"leave {'it' if len(unused) == 1 else 'them'} out."
+            f"{', '.join(unused)}: expected files of other renderers, got {ours}, a clip of jaxdn's own; "
+            f"leave {'it' if len(unused) == 1 else 'them'} out{', or denoise the clip by itself' if mixed else ''}."
         )

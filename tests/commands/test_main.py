@@ -120,12 +120,14 @@ def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
 @pytest.mark.slow
 def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
     one, out = shot / "shot_0000.exr", tmp_path / "new" / "clean.exr"
+    (tmp_path / "folder.exr").mkdir()
     main.main(["denoise", str(one), "-o", str(out), "--method", "svgf", "--preview"])
     assert sorted(path.name for path in out.parent.iterdir()) == ["clean.exr", "clean.png"]
     assert out.is_file()
     for source, place, words in (
         (shot, tmp_path / "x.exr", "expected a folder for 2 frames"),
         (one, one, "expected another place than the input's"),
+        (one, tmp_path / "folder.exr", "expected the name of an EXR file, but there is a folder of that name"),
     ):
         with pytest.raises(SystemExit) as ended:
             main.main(["denoise", str(source), "-o", str(place), "--method", "svgf"])
@@ -274,7 +276,39 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("denoise", "CLIP", "-o", "CLIP", "--method", "svgf"), "another place"),
         (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--spp", "2"), "2 samples a pixel are not available"),
         (("denoise", "CLIP", "-o", "out", "--wrong"), "--wrong"),
-        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"), "'implementation'"),
+        (
+            ("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"),
+            "has no choice, got 'onnxruntime'",
+        ),
+        (
+            ("denoise", "CLIP", "-o", "out", "--method", "svgf", "--budget", "4"),
+            "--budget: expected a method that says where",
+        ),
+        (
+            ("denoise", "CLIP", "-o", "out", "--method", "svgf", "--max-memory", "nan"),
+            "--max-memory: expected more than 0",
+        ),
+        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--max-memory", "0"), "expected more than 0 GiB, got 0"),
+        (
+            ("denoise", "CLIP", "-o", "out", "--method", "svgf", "--frames"),
+            "--frames: expected whole numbers or ranges",
+        ),
+        (("denoise", "CLIP", "SHOT", "-o", "out", "--channels", "albedo=none"), "or denoise the clip by itself"),
+        (("denoise", "CLIPS", "-o", "out", "--method", "svgf"), "square: name such folders"),
+        (("denoise", "SHOT", "-o", "out", "--channels", "albedo=Paint", "albedo=none"), "expected albedo once"),
+        (("denoise", "SHOT", "-o", "out", "--reblur", "shutter=0.5", "shutter=0.1"), "--reblur: expected shutter once"),
+        (("compare", "CLIP", "-o", "out", "--methods"), "--methods: expected at least one, got none"),
+        (("inspect",), "expected a scene, a family, a clip, or EXR files to inspect, got none"),
+        (("inspect", "SHOT", "--width", "3"), "expected none of --width"),
+        (("inspect", "CLIP", "--height", "3"), "expected none of --height"),
+        (("pack", "CLIP", "-o", "CLIP", "--mib", "1"), "expected another place than the clips'"),
+        (("pack", "CLIP", "-o", "RECORD", "--mib", "1"), "expected another place than the clips'"),
+        (("pack", "CLIP", "-o", ".", "--mib", "1"), "expected the name of a file, got a folder"),
+        (("pack", "CLIP", "-o", "out", "--mib", "1", "--seed", "-1"), "--seed: expected a whole number >= 0, got -1"),
+        (("render", "fruit", "-o", "out", "--seeds"), "--seeds: expected whole numbers >= 0 or ranges"),
+        (("render", "fruit", "-o", "out", "--seeds", "1", "0-1"), "--seeds: expected each seed once, got 1 again"),
+        (("render", "fruit", "-o", "out", "--threads-per-clip", "1"), "--threads-per-clip: expected at least 2"),
+        (("train", "CLIP", "-o", "out", "--set", "size=small", "size=large"), "--set: expected size once"),
         (("compare", "nowhere", "-o", "out", "--methods", "noisy"), "nowhere: there is no such folder"),
         (("compare", ".", "-o", "out", "--methods", "noisy"), "expected a clip (a folder with clip.json)"),
         (("compare", "CLIP", "-o", "out", "--methods", "noisy", "magic"), "expected one of noisy, "),
@@ -306,9 +340,11 @@ def test_compare_ends_with_a_report(clip, tmp_path):
 )
 def test_user_errors_give_plain_messages(clip, shot, tmp_path, monkeypatch, capsys, arguments, told):
     monkeypatch.chdir(tmp_path)
-    places = {"CLIP": clip, "SHOT": shot}
+    places = {"CLIP": clip, "SHOT": shot, "CLIPS": clip.parent, "RECORD": clip / "clip.json"}
+    before = sorted(path.name for path in clip.iterdir())
     assert told in told_here(capsys, *(places.get(word, word) for word in arguments))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]  # no incomplete file, hidden or not
+    assert sorted(path.name for path in clip.iterdir()) == before
 
 
 def test_wrong_arguments_end_a_process_with_a_message(clip, tmp_path):

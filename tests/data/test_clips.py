@@ -230,6 +230,48 @@ def test_a_shorter_clip_replaces_a_longer_one(tmp_path: Path, rng: np.random.Gen
     assert clips.read_clip(tmp_path / "c").frames.radiance.shape[0] == 2
 
 
+def test_somebodys_frames_are_not_taken_for_an_old_clip(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Rendered files may be called as a clip's frames are: none is overwritten or removed."""
+    for index in range(4):
+        (tmp_path / f"frame_{index:04d}.exr").write_bytes(b"a render")
+    with pytest.raises(ClipError, match=r"got frame_000\d\.exr and no clip\.json; name another folder"):
+        clips.write_clip(make_clip(rng, 2), tmp_path)
+    assert [path.read_bytes() for path in sorted(tmp_path.iterdir())] == [b"a render"] * 4
+
+
+@pytest.mark.parametrize("wrong", ["albedo", "reference"])
+def test_a_clip_that_is_refused_leaves_the_old_one(tmp_path: Path, rng: np.random.Generator, wrong: str) -> None:
+    clips.write_clip(make_clip(rng, 2), tmp_path / "c")
+    files = {path: path.read_bytes() for path in (tmp_path / "c").iterdir()}
+    clip = make_clip(rng, 2)
+    if wrong == "albedo":
+        clip = clip._replace(frames=clip.frames._replace(albedo=clip.frames.albedo[..., :1]))
+    else:
+        clip = clip._replace(reference=clip.reference[:, :3])
+    for place in ("c", "new"):
+        with pytest.raises(ValueError, match=rf"{wrong}: expected shape"):
+            clips.write_clip(clip, tmp_path / place)
+    assert {path: path.read_bytes() for path in (tmp_path / "c").iterdir()} == files
+    assert not (tmp_path / "new").exists()
+
+
+def test_light_beyond_half_precision_is_counted(tmp_path: Path, rng: np.random.Generator) -> None:
+    clip = make_clip(rng, 2)
+    clip.reference[0, 0, :2] = 1e6
+    with pytest.warns(UserWarning, match=r"values beyond 65504 become that.*: 6 of reference; divide"):
+        clips.write_clip(clip, tmp_path / "c")
+    assert clips.read_clip(tmp_path / "c").reference.max() == 65504
+
+
+@pytest.mark.parametrize("given", [{"channels": {"albedo": "none"}}, {"view": "left"}, {"motion_convention": "uv"}])
+def test_a_clip_of_ours_refuses_what_names_the_channels_of_others(
+    tmp_path: Path, rng: np.random.Generator, given: dict[str, Any]
+) -> None:
+    clips.write_clip(make_clip(rng, 2), tmp_path / "c")
+    with pytest.raises(ClipError, match=f"expected none of {next(iter(given))}, which are for files of other"):
+        clips.read_clip(tmp_path / "c", **given)
+
+
 def test_broken_clips_are_refused_with_the_reason(tmp_path: Path, rng: np.random.Generator) -> None:
     folder = tmp_path / "c"
     clips.write_clip(make_clip(rng, 4), folder)

@@ -167,6 +167,26 @@ def test_windows_are_put_into_one_picture(tmp_path: Path) -> None:
         assert frame.radiance[index].any()
 
 
+def test_a_window_far_from_the_picture_names_its_file(tmp_path: Path) -> None:
+    """One such file would make every frame as large as the distance: gibibytes."""
+    light = {letter: np.ones((8, 12), np.float16) for letter in "RGB"}
+    for index, left in enumerate([0, 0, 40000]):
+        window = (np.array([left, left], np.int32), np.array([left + 11, left + 7], np.int32))
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "dataWindow": window,
+                  "displayWindow": programs.box((0, 0, 11, 7))}  # fmt: skip
+        OpenEXR.File(header, light).write(str(tmp_path / f"a_{index}.exr"))
+    with pytest.raises(clips.ClipError, match=r"a_2\.exr: expected a data window near the picture of 12 x 8 pixels"):
+        clips.read_clip(tmp_path)
+
+
+def test_a_view_that_is_not_there_is_told(tmp_path: Path) -> None:
+    source = write_shot("Arnold", tmp_path)
+    with pytest.raises(
+        clips.ClipError, match=r"--view: expected files that have the view 'nope', got .* without views"
+    ):
+        clips.read_clip(source, motion_convention="none", view="nope")
+
+
 def test_overscan_is_denoised_and_kept(tmp_path: Path) -> None:
     """More pixels than the picture has, to the left of it and above."""
     rng = np.random.default_rng(0)

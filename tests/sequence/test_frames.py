@@ -76,6 +76,9 @@ def test_only_the_wanted_frames_are_written(tmp_path: Path) -> None:
     files, told = denoise(source, tmp_path / "out", skip_existing=True)
     assert files == ["a.0008.exr", "a.0009.exr", "a.0013.exr", "a.0014.exr"]
     assert "3 frames are there already" in told[0]
+    (tmp_path / "out" / "a.0012.exr").write_bytes(b"")  # somebody's placeholder is no result
+    files, _ = denoise(source, tmp_path / "out", skip_existing=True)
+    assert files == ["a.0012.exr"]
     with pytest.raises(ValueError, match=r"--frames 20-21: expected frames that are there, got none of .* 8-14"):
         denoise(source, tmp_path / "out", frames=[20, 21])
 

@@ -14,10 +14,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdn.core.frame import OF_SAMPLES, Clip, frame_at, only, present
-from jaxdn.data.clip.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
+from jaxdn.core.frame import OF_SAMPLES, Clip, Frame, frame_at, only, present
+from jaxdn.data.clip.frames import StoredFrame, encode_frame, layers_for, read_frame, stored_layers, write_frame
 from jaxdn.data.clip.record import FORMAT, check_record, is_planned, shared_with
 from jaxdn.data.errors import ClipError, read_json
+from jaxdn.data.exr.exr import HALF_MAX
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.runtime.atomic_files import write_json
 
@@ -115,11 +116,12 @@ def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None
 
     The clip's radiance becomes its one noisy layer of ``spp`` samples a pixel. ``record`` is stored as ``clip.json``
     with the entries that follow from the frames (format, frames, width, height, layers) filled in. Light, fractions and
-    directions keep half precision (:attr:`jaxdn.core.frame.Buffer.stored`). Raises ValueError for shapes that do not
-    fit each other or a record that is not JSON, before anything is written; OSError if a file cannot be written.
+    directions keep half precision (:attr:`jaxdn.core.frame.Buffer.stored`); a warning counts light beyond 65504, which
+    becomes that. Raises ValueError for shapes that do not fit each other or a record that is not JSON, and ClipError
+    for a folder with frames that are no clip's, before anything is written; OSError if a file cannot be written.
     """
     folder = Path(path)
-    if np.ndim(clip.frames.radiance) != 4:
+    if np.ndim(clip.frames.radiance) != 4 or not np.size(clip.frames.radiance):
         raise ValueError(f"{folder}: expected radiance [T, H, W, 3], got shape {np.shape(clip.frames.radiance)}.")
     clip = jax.tree.map(np.asarray, clip._replace(layers=None))
     count, height, width = clip.frames.radiance.shape[:3]
@@ -128,15 +130,51 @@ def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None
         raise ValueError(f"{folder}: expected {count} frames in every buffer, got {sorted(lengths)}.")
     facts = {"format": FORMAT, "frames": count, "width": width, "height": height, "layers": [spp]}
     whole_record = {"name": folder.name, **(record or {}), **facts}
-    begin_record(whole_record, folder)
-    for index in range(count):
+    _refuse_others(folder)
+
+    def parts(index: int) -> tuple[Path, Frame, dict[str, Any]]:
         frame = frame_at(clip.frames, index)
         reference = None if clip.reference is None else clip.reference[index]
-        write_frame(frame_path(folder, index), frame, layers={spp: frame.radiance}, reference=reference)
+        return frame_path(folder, index), frame, {"layers": {spp: frame.radiance}, "reference": reference}
+
+    path, frame, images = parts(0)
+    encode_frame(path, frame, **images)  # raises what a frame would while nothing is written
+    _warn_of_clamped(clip, folder)
+    begin_record(whole_record, folder)
+    for index in range(count):
+        path, frame, images = parts(index)
+        write_frame(path, frame, **images)
     for number, stale in _numbered(folder):
         if number >= count:
             stale.unlink()
     finish_record(whole_record, folder)
+
+
+def _refuse_others(folder: Path) -> None:
+    """Raise ClipError for a folder with frames that are no clip's: a renderer may call its files alike."""
+    others = _numbered(folder)
+    if others and not any((folder / name).is_file() for name in (RECORD, _UNFINISHED)):
+        raise ClipError(
+            f"{folder}: expected a clip or a folder without frames, got {others[0][1].name} and no {RECORD}; name "
+            "another folder."
+        )
+
+
+def _warn_of_clamped(clip: Clip, folder: Path) -> None:
+    """Warn of light that half precision cannot hold."""
+    light = {"radiance": clip.frames.radiance, "reference": clip.reference}
+    counts = {
+        name: int(np.count_nonzero(np.isfinite(image) & (np.abs(image) > HALF_MAX)))
+        for name, image in light.items()
+        if image is not None
+    }
+    found = ", ".join(f"{number} of {name}" for name, number in counts.items() if number)
+    if found:
+        warnings.warn(
+            f"{folder}: values beyond {HALF_MAX:g} become that, as light is stored in half precision: {found}; divide "
+            "the light by a number that brings it below.",
+            stacklevel=3,
+        )
 
 
 def read_frames(path: str | Path, *, spp: int = 1, order: Iterable[int] | None = None) -> Iterator[StoredFrame]:

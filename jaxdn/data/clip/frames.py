@@ -66,6 +66,31 @@ def write_frame(
     65504 are clamped; NaN and infinities are kept), distances and vectors in single precision. Raises ValueError for
     shapes that do not fit each other, OSError if the file cannot be written.
     """
+    channels = encode_frame(
+        path,
+        frame,
+        layers=layers,
+        reference=reference,
+        reference_half=reference_half,
+        draws=draws,
+        layer_guides=layer_guides,
+        reference_guides=reference_guides,
+    )
+    write_exr(path, channels)
+
+
+def encode_frame(
+    path: str | Path,
+    frame: Frame,
+    *,
+    layers: Mapping[int, Any] | None = None,
+    reference: Any = None,
+    reference_half: Any = None,
+    draws: Any = None,
+    layer_guides: Mapping[int, Mapping[str, Any]] = MappingProxyType({}),
+    reference_guides: Mapping[str, Any] = MappingProxyType({}),
+) -> dict[str, np.ndarray]:
+    """The channels [H, W] of a frame's file, in the precision in which they are stored. As :func:`write_frame`."""
     layers = {1: frame.radiance} if layers is None else layers
     if not layers:
         raise ValueError(f"{path}: expected at least one noisy layer, got none.")
@@ -90,7 +115,7 @@ def write_frame(
             raise ValueError(f"{path}: {name}: expected shape {expected}, got {image.shape}.")
         stored = _encode(f"{path}: {name}", image, buffer)
         channels |= {f"{name}.{letter}": stored[..., i] for i, letter in enumerate(buffer.letters)}
-    write_exr(path, channels)
+    return channels
 
 
 def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:

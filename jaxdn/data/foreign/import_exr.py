@@ -5,6 +5,7 @@ Channels are found by their names (:mod:`jaxdn.data.foreign.layers`), motion vec
 (:mod:`jaxdn.data.foreign.reflectance`).
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +24,11 @@ from jaxdn.data.foreign.reflectance import derive_reflectance
 from jaxdn.data.foreign.repairs import FRACTIONS, Repairs
 from jaxdn.data.foreign.shot_files import find_sequence
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
-from jaxdn.data.foreign.views import open_views
+from jaxdn.data.foreign.views import open_views, select_view
 from jaxdn.filters.time_reversal import reverse_time
+
+_LARGEST_UNION = 4
+"""Pixels of a shot's frames as a multiple of the picture's, or of the largest data window's."""
 
 
 def plain_frames(
@@ -60,7 +64,8 @@ def plain_frames(
     """
     naming = ChannelNaming(motion_convention, channels, layer, view)
     if isinstance(path, str | Path):
-        opened = next(iter(open_views(find_sequence(path, naming.pass_files), view).values()))
+        (shot,) = select_view([find_sequence(path, naming.pass_files)], view)
+        opened = next(iter(open_views(shot, view).values()))
     else:
         opened = tuple(ExrFile(file) for file in path)
     return [file.path for file in opened], ForeignSequence(opened, naming).frames(backwards=backwards, log=log)
@@ -81,10 +86,11 @@ class ForeignSequence:
     def window(self) -> Window:
         """The pixels that the frames have: the union of their data windows, from the headers alone.
 
-        Raises ClipError for files whose pictures (display windows) differ. A file that cannot be read is left out
+        Raises ClipError for files whose pictures (display windows) differ, and for a window that lies so far away that
+        the union would be many times the picture. A file that cannot be read is left out
         here; it is an error when its frame is read.
         """
-        windows: set[Window] = set()
+        windows: dict[Window, Path] = {}
         picture: Window | None = None
         for file in self.files:
             try:
@@ -97,9 +103,13 @@ class ForeignSequence:
                     f"{file.path}: expected {picture.size[1]} x {picture.size[0]} pixels as in the first frame, "
                     f"got {display.size[1]} x {display.size[0]}."
                 )
-            windows |= stored
+            windows = dict.fromkeys(stored, file.path) | windows
             file.drop_windows()
-        return union_of(windows) if windows else Window(0, 0, 0, 0)
+        if picture is None:
+            return Window(0, 0, 0, 0)
+        union = union_of(windows)
+        _check_union(union, windows, picture)
+        return union
 
     @property
     def lacks_motion(self) -> bool:
@@ -225,6 +235,25 @@ def _converted(name: str, image: np.ndarray, channels: Channels, convention: str
         # Where there is nothing, programs write 0, infinity or a large number.
         return np.where(np.isfinite(image) & (image > 0) & (image < FAR), image, np.float32(FAR))
     return image
+
+
+def _check_union(union: Window, windows: Mapping[Window, Path], picture: Window) -> None:
+    """Raise ClipError, naming the file, where the union of data windows is far larger than the picture and each window.
+
+    With overscan of half the picture on every side it is four times as large.
+    """
+    if math.prod(union.size) <= _LARGEST_UNION * max(math.prod(each.size) for each in (picture, *windows)):
+        return
+
+    def distance(window: Window) -> int:
+        return max(abs(end - other) for end, other in zip(window, picture, strict=True))
+
+    odd = max(windows, key=distance)
+    (height, width), (rows, columns) = picture.size, union.size
+    raise ClipError(
+        f"{windows[odd]}: expected a data window near the picture of {width} x {height} pixels, got {tuple(odd)}: all "
+        f"frames would have {columns} x {rows} pixels; leave the file out, or write it again."
+    )
 
 
 def _mark_unnumbered(ids: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None) -> np.ndarray:

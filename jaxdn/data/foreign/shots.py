@@ -70,7 +70,9 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
     else:
         files = _expand(Path(path))
     if not files:
-        raise ClipError(f"{path}: expected a folder of EXR files, a pattern that fits some, or one; found none.")
+        deeper = sorted(Path(path).glob("*/*.exr")) if isinstance(path, str | Path) else []
+        below = f", but some in {deeper[0].parent}: name such folders" if deeper else ""
+        raise ClipError(f"{path}: expected a folder of EXR files, a pattern that fits some, or one; found none{below}.")
     numbered: dict[tuple[Path, str, str], dict[Number, Path]] = {}
     single = []
     for file, name, number in read_frame_names(_once(files)):
