@@ -8,7 +8,7 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.clips import ClipError
-from jaxdn.core.frame import Frame
+from jaxdn.core.frame import FAR, Frame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import UNNAMED
@@ -204,6 +204,18 @@ def test_clamped_pixels_are_counted_once_in_both_directions(tmp_path: Path) -> N
         assert len(list(sequence.frames(backwards=backwards, log=told.append))) == 3
     assert told == ["roughness: 2 pixels of 'V.Denoising Roughness' beyond [0, 1], such as -0.3: clamped"]
     assert list(sequence.repairs.totals()) == ["roughness: 4 pixels of 2 frames were clamped to [0, 1]"]
+
+
+def test_depths_that_are_no_numbers_are_far_counted_and_told(tmp_path: Path) -> None:
+    depth = truth(0).depth.copy()
+    depth[3, 4:6], depth[0, 0] = np.nan, np.inf  # infinity is how renderers write that nothing is there
+    frames, told = read(tmp_path, blender(0, depth=depth), blender(1), blender(2, depth=depth))
+    assert np.all(frames[0].depth[3, 4:6] == FAR)
+    assert frames[0].depth[0, 0] == FAR
+    assert told == ["depth: 2 pixels of 'V.Depth' NaN: taken as far away"]
+    sequence = ForeignSequence([ExrFile(path) for path in sorted(tmp_path.iterdir())], UNNAMED)
+    assert len(list(sequence.frames())) == 3
+    assert list(sequence.repairs.totals()) == ["depth: 4 pixels of 2 frames were NaN, taken as far away"]
 
 
 def test_a_lamp_in_an_albedo_that_is_named_outright_ends_nothing(tmp_path: Path) -> None:

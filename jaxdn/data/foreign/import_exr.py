@@ -204,10 +204,12 @@ def _make_frame(
     file: ExrFile, pixels: Mapping[str, np.ndarray], mapping: ChannelMapping, repairs: Repairs
 ) -> tuple[Frame, list[str]]:
     """One frame, and in words what was derived, or left unused."""
-    buffers = {
-        name: _converted(name, stack_channels(pixels, channels), channels, mapping.convention)
-        for name, channels in mapping.buffers.items()
-    }
+    buffers = {}
+    for name, channels in mapping.buffers.items():
+        values = stack_channels(pixels, channels)
+        if BUFFERS[name].kind == "distance" and name != "specular_hit_distance":  # there NaN is unknown, as 0 is
+            values = repairs.replace_nan(name, layer_of(channels), values)
+        buffers[name] = _converted(name, values, channels, mapping.convention)
     for name in set(FRACTIONS) & set(buffers):
         buffers[name] = repairs.clamp(name, layer_of(mapping.buffers[name]), buffers[name])
     if "ids" in buffers and not is_cryptomatte(mapping.buffers["ids"]):

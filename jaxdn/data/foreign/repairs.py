@@ -1,4 +1,7 @@
-"""Values of another renderer's guides that no fraction can have: clamped to [0, 1], counted, and told in words."""
+"""Values of another renderer's guides that mean nothing: replaced, counted, and told in words.
+
+Fractions are clamped to [0, 1]; a distance that is NaN counts as far away.
+"""
 
 from collections.abc import Iterable
 
@@ -16,7 +19,7 @@ _MANY = 0.1
 
 
 class Repairs:
-    """What is clamped in the frames of a shot."""
+    """What is replaced in the frames of a shot."""
 
     def __init__(self) -> None:
         self._pixels: dict[str, int] = {}
@@ -45,25 +48,37 @@ class Repairs:
             self._sound.add(name)
         return np.clip(values, 0.0, 1.0)
 
+    def replace_nan(self, name: str, layer: str, values: np.ndarray) -> np.ndarray:
+        """Distances [H, W, 1] with infinity, which is far away, in place of NaN."""
+        odd = np.isnan(values)
+        if count := int(odd.sum()):
+            if name not in self._frames:
+                self._news.append(f"{name}: {_pixels(count)} of {layer!r} NaN: taken as far away")
+            self._add(name, count)
+            values = np.where(odd, np.inf, values)
+        return values
+
     def restart(self) -> None:
         """Count anew: the same frames are read once more. What has been told is not told again."""
         self._pixels = dict.fromkeys(self._pixels, 0)
         self._frames = dict.fromkeys(self._frames, 0)
 
     def news(self) -> list[str]:
-        """What has been clamped for the first time since this was asked for, as lines."""
+        """What has been replaced for the first time since this was asked for, as lines."""
         news, self._news = self._news, []
         return news
 
     def totals(self) -> Iterable[str]:
-        """How much was clamped in all frames, as lines, of buffers where that is more than in the first one."""
+        """How much was replaced in all frames, as lines, of buffers where that is more than in the first one."""
         for name, frames in self._frames.items():
             if frames > 1:
-                yield f"{name}: {self._pixels[name]} pixels of {frames} frames were clamped to [0, 1]"
+                distance = name in BUFFERS and BUFFERS[name].kind == "distance"
+                what = "NaN, taken as far away" if distance else "clamped to [0, 1]"
+                yield f"{name}: {self._pixels[name]} pixels of {frames} frames were {what}"
 
     def _count(self, name: str, layer: str, count: int, known: np.ndarray) -> None:
         if name not in self._frames:
-            pixels = f"{count} pixel{'s' * (count != 1)}"
+            pixels = _pixels(count)
             low, high = known.min(initial=0), known.max(initial=1)
             if name == "albedo" and low >= -SLACK:
                 what = f"{pixels} of {layer!r} above 1, up to {high:g}: the light of a lamp, taken as 1"
@@ -71,8 +86,15 @@ class Repairs:
                 worst = high if high - 1 > -low else low
                 what = f"{pixels} of {layer!r} beyond [0, 1], such as {worst:g}: clamped"
             self._news.append(f"{name}: {what}")
+        self._add(name, count)
+
+    def _add(self, name: str, count: int) -> None:
         self._pixels[name] = self._pixels.get(name, 0) + count
         self._frames[name] = self._frames.get(name, 0) + 1
+
+
+def _pixels(count: int) -> str:
+    return f"{count} pixel{'s' * (count != 1)}"
 
 
 def _explain_wrong(name: str, layer: str, known: np.ndarray) -> str:
