@@ -248,7 +248,16 @@ def select_weights(
     features: Sequence[jax.Array | None],
     groups: Sequence[int],
 ) -> dict[str, Any]:
-    """The weights of a network that sees only the groups which are there, out of those for all groups."""
+    """The weights of a network that sees only the groups which are there, out of those for all groups.
+
+    Raises ValueError for ``params`` of another network.
+    """
+    layers = {name.partition("/")[0] for name in network.kernels()}
+    if set(params) != layers:
+        raise ValueError(
+            f"params: expected the layers {', '.join(sorted(layers))}, got {', '.join(sorted(params)) or 'none'}; "
+            "pass what init or load_weights gives."
+        )
     weights = nnx.merge(structure, params).weights(network.kernels())
     if any(group is None for group in features):
         first = next(iter(weights))

@@ -69,7 +69,7 @@ def test_our_own_clips_are_for_our_own_method(tmp_path: Path, capsys: pytest.Cap
     assert f"method: {DEFAULT_MODEL} (" in capsys.readouterr().out
 
 
-def test_an_engine_that_is_named_does_not_choose_another_method(
+def test_a_backend_that_is_named_does_not_choose_another_method(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     require("pyoidn")

@@ -25,7 +25,7 @@ FAILS = {
 
 
 @pytest.mark.parametrize("kind", FAILS)
-def test_an_engine_that_fails_ends_denoising_with_what_to_change(
+def test_a_backend_that_fails_ends_denoising_with_what_to_change(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     error, option, reason = FAILS[kind]
@@ -45,7 +45,7 @@ def test_an_engine_that_fails_ends_denoising_with_what_to_change(
     assert reason in text
 
 
-def test_any_other_error_of_an_engine_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_other_error_of_a_backend_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise jax.errors.JaxRuntimeError("INTERNAL: a bug")
 
@@ -63,7 +63,7 @@ def test_any_other_error_of_an_engine_keeps_its_traceback(tmp_path: Path, monkey
     ],
 )
 @pytest.mark.parametrize("kind", FAILS)
-def test_an_engine_that_fails_ends_training_and_comparing_too(
+def test_a_backend_that_fails_ends_training_and_comparing_too(
     *,
     command: list[str],
     where: str,

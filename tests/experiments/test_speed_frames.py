@@ -10,7 +10,7 @@ from jaxdn.networks.backends import BACKENDS
 from jaxdn.ops.dispatch import numba_call
 
 
-def test_every_engine_for_inference_that_runs_here_is_timed():
+def test_every_backend_for_inference_that_runs_here_is_timed():
     backends = [name for name in ("onednn-bfloat16", "onednn-float32", "onnxruntime") if BACKENDS[name].available()]
     found = set(builds(["svgf", "steady-fast"], 32, 48)) - {OIDN}
     methods = ("svgf", "steady-fast")

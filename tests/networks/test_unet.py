@@ -163,6 +163,9 @@ def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) 
         network.apply(params, features(rng, (3, 3)))
     with pytest.raises(ValueError, match="features: expected"):
         network.apply(params, [None, None])
+    for wrong, told in (({}, "got none"), ({**params, "guide": {}}, "got decoder_0, .*, guide, head_0")):
+        with pytest.raises(ValueError, match=f"params: expected the layers decoder_0, .*{told}.*; pass what init"):
+            network.apply(wrong, features(rng, (3, 2), (16, 32)))
 
 
 def test_only_the_networks_package_imports_flax() -> None:
@@ -205,7 +208,7 @@ OTHER = GraphSpec(
 
 
 @pytest.mark.parametrize("backend", ["reference", "onnxruntime"])
-def test_every_engine_runs_whatever_network_is_described(backend: str, rng: np.random.Generator) -> None:
+def test_every_backend_runs_whatever_network_is_described(backend: str, rng: np.random.Generator) -> None:
     if backend == "onnxruntime":
         require("onnxruntime")
     weights = {
