@@ -44,7 +44,7 @@ def test_the_command_line_is_one_that_jaxdn_reads(tmp_path):
     )  # fmt: skip
     assert numbers(read.frames, "--frames") == [1, 2, 3, 7]
     usual = tyro.cli(COMMANDS, args=denoise_command("p", Path("a.exr"), Path("o"), [-2, 1], bidirectional=True)[4:])
-    assert (usual.method, usual.safe, usual.bidirectional, usual.frames) == ("auto", True, True, [])
+    assert (usual.method, usual.safe, usual.bidirectional, usual.frames) == ("auto", True, True, None)
 
 
 def test_progress_is_read_from_what_jaxdn_prints(capsys):
