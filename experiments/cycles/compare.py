@@ -22,6 +22,7 @@ import tyro
 from experiments.cycles import reference as references
 from experiments.cycles.record import RECORD, read_record
 from experiments.cycles.score import Scored, score
+from experiments.cycles.sets import kinds_of
 from experiments.measurement import describe_measurement
 from jaxdn.clips import open_frames, read_exr
 from jaxdn.commands.errors import plain_errors
@@ -189,9 +190,13 @@ def means(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
         for spp in options.spp
         for method in options.methods
     ]
+    unseen = sorted({row["kind"] for row in rows} - set(kinds_of("train")))
+    strange = (
+        f"; {' and '.join(f'`{kind}`' for kind in unseen)} are kinds that nothing was trained on" if unseen else ""
+    )
     what = (
-        f"Means over {_count(rows)} of Blender's Cycles that nothing was trained on or chosen by (`make cycles`); "
-        "`ball` and `leaves` are kinds that nothing was trained on. Files through `jaxdn denoise`, all light; "
+        f"Means over {_count(rows)} of Blender's Cycles that nothing was trained on or chosen by (`make cycles`)"
+        f"{strange}. Files through `jaxdn denoise`, all light; "
         "`+no-safe` is `--no-safe`, `+prefiltered` is Open Image Denoise as Blender runs it by default, with guides "
         "that it denoises first. Open Image Denoise is that of the quality high. PSNR of x / (1 + x) in dB, without "
         "the references' noise. *Edges* are the tenth of the pixels whose guides differ most from their neighbours'. "
