@@ -16,6 +16,7 @@ from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.measured_motion import fitting_conventions
 from jaxdn.ops.warp import warp
+from jaxdn.render.mitsuba.variant import use_variant
 from tests import programs
 from tests.needs import require_module
 from tests.programs import FULL, HEIGHT, PROGRAMS, STEP, WIDTH, Truth, corner, truth, write_shot
@@ -244,7 +245,7 @@ def test_a_cryptomatte_in_half_precision_has_no_ids(tmp_path: Path) -> None:
 def test_the_names_of_mitsuba_are_those_of_mitsuba(tmp_path: Path) -> None:
     """Written by the renderer itself, with the names of its manual."""
     mi = require_module("mitsuba")
-    mi.set_variant("scalar_rgb")
+    use_variant("scalar_rgb")
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": 12, "height": 8}
     scene["sensor"]["sampler"]["sample_count"] = 1
