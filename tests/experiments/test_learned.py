@@ -164,6 +164,11 @@ def test_claims_hold_or_not_by_the_numbers() -> None:
     assert (adaptive.ours, adaptive.holds) == ("0.50", True)
     assert not claims["NTASD is steadier than DASR, temporal PSNR"].holds
     assert claims["NTASD is better than RAE, PSNR"].ours == "+1.50 dB"
+    direct = claims["direct prediction / kernels, single frames, relative MSE"]
+    assert (direct.ours, direct.holds) == ("1.00", False)
+    rows["single frames, direct"]["unbiased_relative_mse"] = 2.2  # far from the paper's 1.7
+    direct = ntasd_methods.claims(results_of(**rows))[2]
+    assert (direct.ours, direct.holds) == ("1.10", False)
     text = scores.claims_table(claims.values())
     assert "| NTASD is steadier than DASR, temporal PSNR | above 0 | -1.00 dB | not here |" in text
 
@@ -206,6 +211,10 @@ def test_the_ladder_is_climbed_step_by_step() -> None:
     assert claims["the large network is better, PSNR"].ours == "+2.50 dB"
     # 42 and 14 ms are those of networks with samplers; what is measured here has none: 21 + 1 and 10 + 1.
     assert claims["and slower, without samplers"].paper == "2.0 times"
+    assert not claims["and slower, without samplers"].holds  # 10 ms and 10 ms
+    given[ntasd_sizes.LARGE]["unbiased_psnr"] = 25.2
+    worth = ntasd_sizes.claims(results_of(**given))[0]
+    assert (worth.ours, worth.holds) == ("+0.20 dB", False)  # a third of the paper's 0.6 dB
 
 
 def test_stages_are_what_the_papers_compare() -> None:
