@@ -27,10 +27,11 @@ def describe_measurement(
       rows: the numbers.
     """
     machine = describe_machine()
+    cores = f"{machine['cores']} core{'s' * (machine['cores'] != 1)}"
     measured = {
         "revision": find_revision() or "unknown",
         "date": datetime.now(UTC).date().isoformat(),
-        "machine": f"{machine['cores']} cores of {machine['processor']}, device {machine['device']}",
+        "machine": f"{cores} of {machine['processor']}, device {machine['device']}",
     }
     about = {"kind": kind, "title": title, "section": section, "order": order, "measured": measured}
     return {**about, "command": command, "what": what, "rows": list(rows)}
