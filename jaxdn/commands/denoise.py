@@ -61,11 +61,8 @@ def _denoise_files(options: Denoise, naming: ChannelNaming, on_start: Callable[[
     """Frames of clips and of other renderers."""
     if options.max_memory is not None and not 0 < options.max_memory < math.inf:
         raise ValueError(f"--max-memory: expected more than 0 GiB, got {options.max_memory:g}.")
-    known = find_model(options.method).method
-    if options.budget is not None and (known is None or not known.has_option("budget")):
-        raise ValueError(
-            f"--budget: expected a method that says where samples go (ntasd, dasr), got {options.method}; leave it out."
-        )
+    if options.budget is not None:
+        _check_budget(options.method)
     method, backend = select_backend(options.method, options.implementation, **_budget(options))
     settings = Settings(
         spp=options.spp,
@@ -186,6 +183,15 @@ def _scene_of(options: Denoise) -> str | None:
 def _frames(options: Denoise) -> list[int] | None:
     """The numbers of the frames to denoise; None: all."""
     return None if options.frames is None else numbers(options.frames, "--frames", negative=True)
+
+
+def _check_budget(name: str) -> None:
+    """Raise ValueError for a method that does not say where samples go."""
+    known = find_model(name).method
+    if known is None or not known.has_option("budget"):
+        raise ValueError(
+            f"--budget: expected a method that says where samples go (ntasd, dasr), got {name}; leave it out."
+        )
 
 
 def _budget(options: Denoise) -> dict[str, Any]:
