@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdn.core.frame import OF_SAMPLES, Clip, Frame, frame_at, only, present
+from jaxdn.core.frame import OF_SAMPLES, Clip, frame_at, only, present
 from jaxdn.data.clip.frames import StoredFrame, encode_frame, layers_for, read_frame, stored_layers, write_frame
 from jaxdn.data.clip.record import FORMAT, check_record, is_planned, shared_with
 from jaxdn.data.errors import ClipError, read_json
@@ -132,18 +132,17 @@ def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None
     whole_record = {"name": folder.name, **(record or {}), **facts}
     _refuse_others(folder)
 
-    def parts(index: int) -> tuple[Path, Frame, dict[str, Any]]:
+    def stored_frame(index: int) -> StoredFrame:
         frame = frame_at(clip.frames, index)
-        reference = None if clip.reference is None else clip.reference[index]
-        return frame_path(folder, index), frame, {"layers": {spp: frame.radiance}, "reference": reference}
+        reference = None if clip.reference is None else np.asarray(clip.reference[index])
+        return StoredFrame(frame, {spp: np.asarray(frame.radiance)}, reference)
 
-    path, frame, images = parts(0)
-    encode_frame(path, frame, **images)  # raises what a frame would while nothing is written
+    encode_frame(frame_path(folder, 0), stored_frame(0))  # raises what a frame would while nothing is written
     _warn_of_clamped(clip, folder)
     begin_record(whole_record, folder)
     for index in range(count):
-        path, frame, images = parts(index)
-        write_frame(path, frame, **images)
+        one = stored_frame(index)
+        write_frame(frame_path(folder, index), one.frame, layers=one.layers, reference=one.reference)
     for number, stale in _numbered(folder):
         if number >= count:
             stale.unlink()

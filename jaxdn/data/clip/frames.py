@@ -66,44 +66,31 @@ def write_frame(
     65504 are clamped; NaN and infinities are kept), distances and vectors in single precision. Raises ValueError for
     shapes that do not fit each other, OSError if the file cannot be written.
     """
-    channels = encode_frame(
-        path,
-        frame,
-        layers=layers,
-        reference=reference,
-        reference_half=reference_half,
-        draws=draws,
-        layer_guides=layer_guides,
-        reference_guides=reference_guides,
-    )
-    write_exr(path, channels)
-
-
-def encode_frame(
-    path: str | Path,
-    frame: Frame,
-    *,
-    layers: Mapping[int, Any] | None = None,
-    reference: Any = None,
-    reference_half: Any = None,
-    draws: Any = None,
-    layer_guides: Mapping[int, Mapping[str, Any]] = MappingProxyType({}),
-    reference_guides: Mapping[str, Any] = MappingProxyType({}),
-) -> dict[str, np.ndarray]:
-    """The channels [H, W] of a frame's file, in the precision in which they are stored. As :func:`write_frame`."""
     layers = {1: frame.radiance} if layers is None else layers
+    given = StoredFrame(frame, layers, reference, reference_half, draws, layer_guides, reference_guides)
+    write_exr(path, encode_frame(path, given))
+
+
+def encode_frame(path: str | Path, given: StoredFrame) -> dict[str, np.ndarray]:
+    """The channels [H, W] of a frame's file, in the precision in which they are stored.
+
+    Raises ValueError as :func:`write_frame` does.
+    """
+    layers = given.layers
     if not layers:
         raise ValueError(f"{path}: expected at least one noisy layer, got none.")
     if any(isinstance(samples, bool) or not isinstance(samples, int) or samples < 1 for samples in layers):
         raise ValueError(f"{path}: layers: expected whole numbers of samples, got {list(layers)}.")
-    images = {f"noisy_{samples}spp": (image, _LIGHT) for samples, image in sorted(layers.items())}
-    images |= {"reference": (reference, _LIGHT), "reference_half": (reference_half, _LIGHT)}
-    for index, draw in enumerate(() if draws is None else draws):
+    images: dict[str, tuple[Any, Buffer]] = {
+        f"noisy_{samples}spp": (image, _LIGHT) for samples, image in sorted(layers.items())
+    }
+    images |= {"reference": (given.reference, _LIGHT), "reference_half": (given.reference_half, _LIGHT)}
+    for index, draw in enumerate(() if given.draws is None else given.draws):
         images |= {name: (draw[..., part], _LIGHT) for name, part in _draw_names(index).items()}
-    images |= {name: (getattr(frame, name), BUFFERS[name]) for name in GUIDES}
-    for samples, guides in layer_guides.items():
+    images |= {name: (getattr(given.frame, name), BUFFERS[name]) for name in GUIDES}
+    for samples, guides in given.layer_guides.items():
         images |= {f"noisy_{samples}spp_{name}": (image, BUFFERS[name]) for name, image in guides.items()}
-    images |= {f"reference_{name}": (image, BUFFERS[name]) for name, image in reference_guides.items()}
+    images |= {f"reference_{name}": (image, BUFFERS[name]) for name, image in given.reference_guides.items()}
     size = np.shape(next(iter(layers.values())))[:2]
     channels: dict[str, np.ndarray] = {}
     for name, (image, buffer) in images.items():
