@@ -360,7 +360,7 @@ def test_options_of_the_other_way_are_refused(tmp_path: Path) -> None:
      (["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"], "--workers: expected none with --scheduler"),
      (["--scheduler", "missing.json"], "missing.json: there is no such file; start `dask scheduler"),
      (["--scheduler", "tcp://127.0.0.1:9"], "tcp://127.0.0.1:9: none answers"),
-     (["--threads-per-clip", "1"], "threads: expected at least 2")],
+     (["--threads-per-clip", "1"], "--threads-per-clip: expected at least 2")],
 )  # fmt: skip
 @pytest.mark.needs("distributed")
 def test_the_command_refuses_in_words(
