@@ -41,6 +41,8 @@ class Stage(NamedTuple):
     """Of the method; None: the usual one."""
     spp: int = BUDGET
     """Samples a pixel of what it is trained on, if it asks for none."""
+    start: str | None = None
+    """The stage whose weights are its first ones; None: new weights."""
 
 
 _EVEN = {"size": "small", "adaptive": False}
@@ -56,17 +58,21 @@ def stage_of_budget(kind: str, budget: float) -> str:
 
 
 def _budget_stages() -> Iterator[tuple[str, Stage]]:
-    """A network that chooses its pixels, one with pixels at random, and one with a pattern, for each budget."""
-    for budget in BUDGETS:
+    """A network that chooses its pixels, one with pixels at random, and one with a pattern, for each budget.
+
+    Each goes on from that of the next larger budget: new networks of a quarter of a sample stand still for hundreds of
+    updates. So at each budget all have had the same number of updates.
+    """
+    for budget, larger in zip(BUDGETS, [*BUDGETS[1:], None], strict=True):
         fractions = {"size": "small", "budget": budget, "least": 0, "rounding": "stochastic"}
         even = {**fractions, "adaptive": False}
-        yield stage_of_budget("ntasd", budget), Stage("ntasd", fractions, recipe="paper")
-        yield stage_of_budget("ntasd, uniform", budget), Stage("ntasd", even, recipe="paper")
+        kinds = {"ntasd": fractions, "ntasd, uniform": even}
         if budget in ROTATING:
-            yield (
-                stage_of_budget("ntasd, rotating", budget),
-                Stage("ntasd", {**even, "pattern": "rotating"}, recipe="paper"),
-            )
+            kinds["ntasd, rotating"] = {**even, "pattern": "rotating"}
+        for kind, options in kinds.items():
+            before = "ntasd, uniform" if kind == "ntasd, rotating" and larger not in ROTATING else kind
+            start = None if larger is None else stage_of_budget(before, larger)
+            yield stage_of_budget(kind, budget), Stage("ntasd", options, recipe="paper", start=start)
 
 
 _SINGLE_FRAMES = {**_EVEN, "history": "none"}
@@ -181,6 +187,11 @@ def ready(name: str, settings: Settings) -> Model:
 
 def trained(name: str, settings: Settings) -> Model:
     """A stage, trained if it is not."""
+    return find_model(str(_weights_of(name, settings)))._replace(label=name)
+
+
+def _weights_of(name: str, settings: Settings) -> Path:
+    """The file of a stage's weights, trained if they are not, and before them those that it starts from."""
     stage = publish(STAGES[name]) if settings.as_published else STAGES[name]
     method = method_named(stage.method)
     recipe = method.recipe_named(stage.recipe)._replace(
@@ -190,10 +201,10 @@ def trained(name: str, settings: Settings) -> Model:
     )
     if not settings.as_published:
         recipe = recipe._replace(average=0.99)
-    out = settings.results / file_name(name)
+    start = None if stage.start is None else str(_weights_of(stage.start, settings))
     clips = clips_of(stage, find_clips(settings.data / "train"))
-    weights = train(method, recipe, clips, out, options=stage.options, label=name)
-    return find_model(str(weights))._replace(label=name)
+    out = settings.results / file_name(name)
+    return train(method, recipe, clips, out, options=stage.options, start=start, label=name)
 
 
 def clips_of(stage: Stage, folders: Sequence[Path]) -> list[Path]:
