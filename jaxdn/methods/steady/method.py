@@ -131,9 +131,10 @@ class SteadyState(NamedTuple):
 def steady(options: Options) -> Denoiser:
     """The denoiser.
 
-    Reads albedo, normal, roughness, depth, previous_depth, motion and ids, and reflectance with ``demodulate="brdf"``;
-    without a buffer, what it would guide or test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass
-    through. Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its
+    Reads albedo, normal, roughness, depth, previous_depth, motion, ids and sample_count, and reflectance with
+    ``demodulate="brdf"``; without a buffer, what it would guide or test is left out. Pixels without a surface (depth at
+    ``FAR`` or id -1) pass through; those without samples have the light of their history, or else of their neighbours.
+    Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its
     contents.
     """
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
@@ -144,7 +145,7 @@ def steady(options: Options) -> Denoiser:
     network = unet(
         (4 * 8 + CHANNELS,), heads, widths=quality.widths, head_size=1, implementation=options.implementation
     )
-    reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
+    reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids", "sample_count"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
