@@ -64,6 +64,8 @@ class Method:
     """The module of an optional package that it cannot run without."""
     differentiable: bool = True
     """Its images have gradients."""
+    sparse: bool = False
+    """It is given frames in which only some pixels have samples (``sample_count``), and its images are whole."""
 
     @property
     def learns(self) -> bool:
@@ -146,6 +148,7 @@ def method(
     filter: bool | None = None,
     requires: str = "",
     differentiable: bool = True,
+    sparse: bool = False,
 ) -> Callable[[Callable[[Any], Denoiser]], Callable[..., Denoiser]]:
     """Decorator: enter ``build(options) -> Denoiser`` in the registry, as a factory ``(**options) -> Denoiser``.
 
@@ -177,9 +180,8 @@ def method(
         if name in _METHODS and _METHODS[name].factory.__module__ != build.__module__:
             other = _METHODS[name].factory.__module__
             raise ValueError(f"method {name!r} of {build.__module__}: expected a name of its own; {other} has it too.")
-        row = Method(
-            name, title, factory, options, presets, recipes, variants, backends, ready, requires, differentiable
-        )
+        columns = (options, presets, recipes, variants, backends, ready, requires, differentiable, sparse)
+        row = Method(name, title, factory, *columns)
         _METHODS[name] = row
         return factory
 

@@ -5,12 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import OF_SAMPLES, Frame
 from jaxdn.data.exr.exr import write_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.evaluation.report.images import save_png
+from jaxdn.methods.registry import methods
+from jaxdn.ops.sampling import rotate_pattern, round_stochastically
 from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.open_scene import open_scene
@@ -34,7 +37,7 @@ class SceneSettings(NamedTuple):
     frames: Collection[int] | None = None
     """Numbers of the frames to denoise; None: all of the scene."""
     budget: float = 4.0
-    """Mean number of samples per pixel."""
+    """Mean number of samples per pixel; below 1, most pixels of a frame have none."""
     preview: bool = False
     """Write a PNG next to each frame, and one of its samples."""
 
@@ -51,7 +54,9 @@ def denoise_scene(
 ) -> Written:
     """Render an animated scene as the method asks for samples, and denoise it; returns the files written.
 
-    A method that does not ask has the budget in every pixel. All reflected light is noisy. A file has the channels
+    A method that does not ask has the budget in every pixel; if it takes frames with gaps
+    (:attr:`jaxdn.methods.registry.Method.sparse`), fractions of a sample follow a pattern that rotates from frame to
+    frame (:func:`jaxdn.ops.sampling.rotate_pattern`). All reflected light is noisy. A file has the channels
     ``R, G, B``, the picture, ``denoised.R/G/B``, the reflected light alone, and ``samples.Y``, the number of samples of
     each pixel. Frames before the first that is wanted are rendered for their history. Flat mirrors and glass are seen
     through, unless the method follows reflections itself. Raises ValueError for what is not
@@ -68,11 +73,8 @@ def denoise_scene(
     planned = plan_clip(scene, rendering, frames=wanted[-1] + 1, denoiser=reads)
     assert planned is not None
     rendering = replace(rendering, plan=planned.plan)
-    if method.denoiser.samples is None and (settings.budget < 1 or settings.budget % 1):
-        raise ValueError(
-            f"--budget {settings.budget:g}: expected a whole number of at least 1, as {method.label} does not say "
-            "where samples go."
-        )
+    if method.denoiser.samples is None:
+        _check_even_budget(settings.budget, method)
     if out.is_dir():
         remove_abandoned(out)
     step = stream(method.denoiser, method.params)
@@ -81,7 +83,7 @@ def denoise_scene(
 
     def ask(frame: Frame) -> np.ndarray:
         asked = step.ask(frame, most)
-        return np.full((*frame.radiance.shape[:2], 1), round(settings.budget)) if asked is None else np.asarray(asked)
+        return _allot_evenly(settings.budget, frame, index) if asked is None else np.asarray(asked)
 
     if rendering.see_through and {"mirror", "transmission"} & set(planned.effects):
         log("guides of flat mirrors and glass are those of what they show")
@@ -104,3 +106,22 @@ def denoise_scene(
         log(f"{path.name}: {counts.mean():.3g} samples per pixel, {counts.min():g} to {counts.max():g}")
         on_frame(path, len(files), len(wanted))
     return Written(files, len(step.programs), step.sanitized)
+
+
+def _check_even_budget(budget: float, method: Model) -> None:
+    """Raise ValueError for a budget that cannot be the same everywhere, of a method that does not say otherwise."""
+    sparse = method.method is not None and method.method.sparse
+    if sparse and not 0 < budget <= MOST:
+        raise ValueError(f"--budget {budget:g}: expected a number of samples above 0 up to {MOST}.")
+    if not sparse and (budget < 1 or budget % 1):
+        able = ", ".join(each.name for each in methods().values() if each.sparse)
+        raise ValueError(
+            f"--budget {budget:g}: expected a whole number of at least 1, as {method.label} does not say where samples "
+            f"go; fractions are for methods that do (ntasd, dasr), and for {able}."
+        )
+
+
+def _allot_evenly(budget: float, frame: Frame, index: int) -> np.ndarray:
+    """Whole numbers of samples [H, W, 1] whose mean is ``budget``; fractions go to other pixels in each frame."""
+    height, width = frame.radiance.shape[:2]
+    return np.asarray(round_stochastically(jnp.full((height, width, 1), budget), rotate_pattern(height, width, index)))

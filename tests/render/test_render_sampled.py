@@ -168,6 +168,25 @@ def test_a_filter_that_does_not_ask_gets_the_budget_everywhere(tmp_path):
     np.testing.assert_array_equal(read_exr(tmp_path / "frame_0001.exr")["samples.Y"], 2)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
+def test_half_a_sample_is_one_in_every_second_pixel_and_the_picture_is_whole(tmp_path):
+    """In two frames every pixel has one; only these paths are traced, and pixels without look like their neighbours."""
+    there = ("--width", "40", "--height", "24", "--frames", "0-3", "--method", "steady-fast")
+    for name, budget in (("half", "0.5"), ("whole", "1")):
+        done = jaxdn("denoise", "fruit", "-o", tmp_path / name, *there, "--budget", budget)
+        assert done.returncode == 0, done.stderr
+    half, whole = (
+        [read_exr(tmp_path / name / f"frame_{index:04d}.exr") for index in range(4)] for name in ("half", "whole")
+    )
+    counts = [frame["samples.Y"] for frame in half]
+    for first in (0, 2):
+        np.testing.assert_array_equal(counts[first] + counts[first + 1], 1)
+    image, seen = half[3]["denoised.G"], counts[3] > 0
+    assert image.mean() == pytest.approx(whole[3]["denoised.G"].mean(), rel=0.1)
+    assert image[seen].mean() == pytest.approx(image[~seen].mean(), rel=0.05)
+
+
 WRONG = {
     "a budget below one sample": (("fruit", "--budget", "0.5"), "budget: expected a mean number of samples above 0"),
     "no budget": (("fruit", "--budget", "0"), "budget: expected"),
@@ -197,11 +216,19 @@ def test_what_cannot_be_rendered_is_told(wrong, weights, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("budget", ["2.5", "0"])
-def test_a_filter_that_does_not_ask_has_whole_samples(budget, tmp_path, capsys):
-    options = ("--method", "svgf", "--frames", "0", "--budget", budget)
-    words = told(capsys, "denoise", "fruit", "-o", tmp_path / "out", *options)
-    assert f"--budget {budget}: expected a whole number of at least 1, as svgf" in words
+@pytest.mark.parametrize(
+    ("method", "budget", "words"),
+    [
+        ("svgf", "2.5", "expected a whole number of at least 1, as svgf"),
+        ("svgf", "0", "fractions are for methods that do (ntasd, dasr), and for steady."),
+        ("steady-fast", "0", "expected a number of samples above 0 up to 64."),
+    ],
+)
+def test_what_a_method_that_does_not_ask_cannot_have(method, budget, words, tmp_path, capsys):
+    options = ("--method", method, "--frames", "0", "--budget", budget)
+    found = told(capsys, "denoise", "fruit", "-o", tmp_path / "out", *options)
+    assert f"--budget {budget}: " in found
+    assert words in found
 
 
 @pytest.mark.slow

@@ -127,6 +127,7 @@ class SteadyState(NamedTuple):
     recipes={"usual": Recipe(pyramid_illumination()), "finish": FINISH},
     variants={f"steady-{quality}": {"quality": quality} for quality in QUALITIES},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
+    sparse=True,
 )
 def steady(options: Options) -> Denoiser:
     """The denoiser.
