@@ -142,6 +142,14 @@ def rotate_pattern(height: int, width: int, frame: jax.Array | int) -> jax.Array
     return _fraction((order << 28) ^ _reverse_digits(jnp.asarray(frame).astype(jnp.uint32)))[..., None]
 
 
+def allot_evenly(budget: float, height: int, width: int, frame: jax.Array | int) -> jax.Array:
+    """Whole numbers of samples [H, W, 1] of a frame, ``budget`` in the mean and nowhere more than one from it.
+
+    What is not whole goes to other pixels in each frame (:func:`rotate_pattern`).
+    """
+    return round_stochastically(jnp.full((height, width, 1), budget), rotate_pattern(height, width, frame))
+
+
 def _reverse_digits(number: jax.Array) -> jax.Array:
     """The 32 binary digits of ``number`` (uint32) in the opposite order."""
     for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):

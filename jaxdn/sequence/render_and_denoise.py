@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import OF_SAMPLES, Frame
@@ -13,7 +13,7 @@ from jaxdn.data.exr.exr import write_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.methods.registry import methods
-from jaxdn.ops.sampling import rotate_pattern, round_stochastically
+from jaxdn.ops.sampling import allot_evenly
 from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.open_scene import open_scene
@@ -81,16 +81,18 @@ def denoise_scene(
     sees_sample = method.denoiser.samples is not None and method.denoiser.sees_sample
     most = max(MOST, round(settings.budget * MOST))
 
-    def ask(frame: Frame) -> np.ndarray:
+    def ask(index: int, frame: Frame) -> np.ndarray:
         asked = step.ask(frame, most)
-        return _allot_evenly(settings.budget, frame, index) if asked is None else np.asarray(asked)
+        height, width = frame.radiance.shape[:2]
+        even = allot_evenly(settings.budget, height, width, index) if asked is None else asked
+        return np.asarray(even)
 
     if rendering.see_through and {"mirror", "transmission"} & set(planned.effects):
         log("guides of flat mirrors and glass are those of what they show")
     files: list[Path] = []
     view = None
     for index in range(wanted[-1] + 1):
-        sampled = render_sampled(scene, index, ask, rendering, previous=view, sample_first=sees_sample)
+        sampled = render_sampled(scene, index, partial(ask, index), rendering, previous=view, sample_first=sees_sample)
         view, counts = sampled.view, np.asarray(sampled.frame.sample_count)
         image = np.asarray(step(sampled.frame))
         if index not in wanted:
@@ -119,9 +121,3 @@ def _check_even_budget(budget: float, method: Model) -> None:
             f"--budget {budget:g}: expected a whole number of at least 1, as {method.label} does not say where samples "
             f"go; fractions are for methods that do (ntasd, dasr), and for {able}."
         )
-
-
-def _allot_evenly(budget: float, frame: Frame, index: int) -> np.ndarray:
-    """Whole numbers of samples [H, W, 1] whose mean is ``budget``; fractions go to other pixels in each frame."""
-    height, width = frame.radiance.shape[:2]
-    return np.asarray(round_stochastically(jnp.full((height, width, 1), budget), rotate_pattern(height, width, index)))

@@ -16,9 +16,9 @@ from experiments.speed.chart import __main__ as chart
 from experiments.speed.chart import render_cost, stacks
 from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
-from experiments.speed.chart.footage import EvaluationClip
+from experiments.speed.chart.footage import EvaluationClip, noisy_frames
 from experiments.speed.chart.page import page
-from experiments.speed.chart.render_cost import Cost, fit
+from experiments.speed.chart.render_cost import Cost, fit, mean_cost, measure_cost
 from experiments.speed.chart.scores import MEASURES, score
 from experiments.speed.chart.store import Store, point_key
 from experiments.speed.chart.summary import (
@@ -36,12 +36,13 @@ from experiments.speed.chart.ways import chosen, left_out, registered, ways
 from experiments.speed.timing import Timing
 from experiments.speed.works import scene
 from experiments.speed.works.stages import measure_stages
-from jaxdn.core.frame import Clip, frame_at
+from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.methods import registry
 from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.backends import BACKENDS
+from jaxdn.render import scene_from_record
 from jaxdn.zoo import ready
 from jaxdn.zoo.ready import Model, find_model, untrained_model
 
@@ -65,7 +66,14 @@ def data():
     """Raw measurements as a run stores them."""
     errors = {point_key(RENDERER, spp): {"room": scores(20 + 3 * math.log2(spp))} for spp in (1, 2, 4, 8)}
     errors |= {point_key("filter", spp): {"room": scores(24.5 + 3 * math.log2(spp))} for spp in (1, 2)}
-    cost = {"seconds": {"fixed": 0.1, "sample": 0.5, "buffers": {"": 0.0, "albedo, normal": 0.05, MOTION: 0.25}}}
+    cost = {
+        "seconds": {
+            "fixed": 0.1,
+            "sample": 0.5,
+            "buffers": {"": 0.0, "albedo, normal": 0.05, MOTION: 0.25},
+            "sparse": {},
+        }
+    }
     return {
         "fingerprint": "0123",
         "settings": {"scored frames": 4},
@@ -235,11 +243,41 @@ def test_stages_are_those_of_real_files():
 
 
 def test_the_fit_gives_back_the_cost():
-    cost = Cost(0.3, 0.2, {"albedo": 0.05, "albedo, motion": 0.1})
+    cost = Cost(0.3, 0.2, {"albedo": 0.05, "albedo, motion": 0.1}, {"0.25": 0.4})
     light = {spp: cost.at(spp) for spp in (1, 2, 4)}
-    found = fit(light, {reads: cost.at(1, reads) - cost.at(1) for reads in cost.buffers})
+    found = fit(light, {reads: cost.at(1, reads) - cost.at(1) for reads in cost.buffers}, cost.sparse)
     assert found[:2] == pytest.approx(cost[:2])
     assert found.buffers == pytest.approx(cost.buffers)
+    assert found.at(0.25, "albedo") == pytest.approx(0.45)  # as it was measured, not on the line of whole samples
+    assert mean_cost([found._asdict(), found._asdict()]) == found
+
+
+@pytest.mark.slow
+def test_frames_with_gaps_are_rendered_to_know_their_cost():
+    stage = scene_from_record({"family": "fruit", "seed": 3})
+    found = measure_cost(stage, 96, 128, ["albedo"], ["albedo"], None)["seconds"]
+    assert set(found["sparse"]) == {"0.25", "0.5"}
+    assert all(seconds > 0 for seconds in found["sparse"].values())
+
+
+def test_a_point_below_one_sample_has_the_cost_of_its_frames_with_gaps(data):
+    data["errors"][point_key("filter", 0.5)] = {"room": scores(23)}
+    for costs in data["render"][SIZE].values():
+        costs["seconds"]["sparse"] = {"0.5": 0.2}
+    found = {each.key: each for each in points(data, LABELS)}["filter @ 0.5"]
+    assert found.spp == 0.5
+    reads = LABELS["filter"][2]
+    buffers = next(iter(data["render"][SIZE].values()))["seconds"]["buffers"][reads]
+    assert found.render_ms[SIZE] == pytest.approx(1e3 * (0.2 + buffers))
+
+
+def test_frames_below_one_sample_have_one_in_some_pixels(rng):
+    noisy = rng.random((4, 8, 12, 3)).astype(np.float32)
+    clip = EvaluationClip("room", None, {}, Frame(noisy), {1: noisy, 2: noisy + 1}, noisy, None, noisy, 0, 50.0)
+    frames = noisy_frames(clip, 0.25)
+    np.testing.assert_array_equal(frames.sample_count.sum(axis=0), 1)  # each pixel once in four frames
+    np.testing.assert_array_equal(frames.radiance, np.where(frames.sample_count > 0, noisy, 0))
+    np.testing.assert_array_equal(noisy_frames(clip, 2).radiance, noisy + 1)
 
 
 def test_energy_counters_wrap(tmp_path):

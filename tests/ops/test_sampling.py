@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxdn.ops import sampling
-from jaxdn.ops.sampling import draw_random_numbers, rotate_pattern, round_stochastically
+from jaxdn.ops.sampling import allot_evenly, draw_random_numbers, rotate_pattern, round_stochastically
 
 # One program each, and not one for each of their operations.
 from_layers = jax.jit(sampling.from_layers)
@@ -224,6 +224,14 @@ def test_a_rotating_pattern_is_spread_evenly_in_every_frame():
     assert (half[:, :, 1:] != half[:, :, :-1]).all()
     # Sixteen thresholds, each in every 4x4 block.
     assert sorted(16 * numbers[0, :4, 4:8].ravel()) == list(range(16))
+
+
+@pytest.mark.parametrize("budget", [0.25, 0.5, 1.0, 2.5, 4.0])
+def test_even_samples_are_the_budget_in_the_mean_and_within_one_of_it(budget):
+    frames = np.stack([np.asarray(allot_evenly(budget, 8, 12, index)) for index in range(4)])
+    np.testing.assert_allclose(frames.mean((1, 2, 3)), budget)
+    np.testing.assert_allclose(frames.mean(0), budget)  # each pixel, over four frames
+    assert set(np.unique(frames)) == {np.floor(budget), np.ceil(budget)}
 
 
 def test_the_map_with_fractions_keeps_a_budget_below_one_sample(rng):

@@ -30,11 +30,11 @@ from experiments.speed.chart.breakdown import breakdown, subjects
 from experiments.speed.chart.energy import NOT_MEASURABLE, Meter, find_meter
 from experiments.speed.chart.footage import EvaluationClip, Sizes
 from experiments.speed.chart.page import write_page
-from experiments.speed.chart.render_cost import measure_cost
+from experiments.speed.chart.render_cost import FRACTIONS, measure_cost
 from experiments.speed.chart.scores import MEASURES, picture, score
 from experiments.speed.chart.store import Store, point_key
 from experiments.speed.chart.summary import RENDERER
-from experiments.speed.chart.way import DENOISED_SPP, Way
+from experiments.speed.chart.way import Way
 from experiments.speed.chart.ways import chosen, left_out, ways
 from experiments.speed.timing import measure, peak_mib
 from experiments.speed.workers import WorkerError
@@ -105,9 +105,10 @@ class Run:
 
     def errors(self) -> None:
         """Score the renderer and every denoised point on every clip, and keep the picture that the page shows."""
-        spps = {RENDERER: self.layers}
+        spps: dict[str, Sequence[float]] = {RENDERER: self.layers}
         scored = {RENDERER: None, **{each.name: each.images for each in self.ways if each.images is not None}}
-        spps |= {name: [spp for spp in DENOISED_SPP if spp in self.layers] for name in scored if name != RENDERER}
+        there = [*FRACTIONS, *self.layers] if 1 in self.layers else self.layers
+        spps |= {each.name: [spp for spp in each.samples if spp in there] for each in self.ways}
         todo = [
             (name, spp)
             for name in scored
@@ -125,11 +126,11 @@ class Run:
                     done(f"{point_key(name, spp)}: {mean:.2f} dB")
                 _forget_programs()
 
-    def _scored(self, name: str, spp: int, denoise: Callable[[Frame], np.ndarray] | None) -> float:
+    def _scored(self, name: str, spp: float, denoise: Callable[[Frame], np.ndarray] | None) -> float:
         """Store a point's errors on every clip and its pictures; its mean PSNR. ``denoise``: None leaves the noise."""
         key, found = point_key(name, spp), {}
         for clip in self.clips:
-            noisy = clip.frames._replace(radiance=clip.noisy[spp])
+            noisy = footage.noisy_frames(clip, spp)
             images = np.asarray(noisy.radiance) if denoise is None else denoise(noisy)
             found[clip.name] = score(images, clip)
             save_png(self._picture(key, clip), picture(images[clip.shown]))

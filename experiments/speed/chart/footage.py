@@ -10,6 +10,7 @@ from jaxdn import effects
 from jaxdn.clips import ClipError, read_clip, read_record
 from jaxdn.core.frame import Frame
 from jaxdn.data.clip.noise_floor import read_halves, read_noise_floor
+from jaxdn.ops.sampling import allot_evenly
 from jaxdn.render import ClipJob, render_clips
 from jaxdn.render.settings import RenderSettings
 
@@ -104,6 +105,15 @@ def read(folder: Path) -> EvaluationClip:
     floor, halves = read_noise_floor(folder), read_halves(folder)
     reference = np.asarray(clip.reference)
     return EvaluationClip(folder.name, folder, record, frames, noisy, reference, halves, hidden, shown, floor)
+
+
+def noisy_frames(clip: EvaluationClip, spp: float) -> Frame:
+    """The frames with so many samples per pixel; below 1, of the layer of one sample, in a pattern that rotates."""
+    if spp >= 1:
+        return clip.frames._replace(radiance=clip.noisy[int(spp)])
+    count, height, width = clip.noisy[1].shape[:3]
+    counts = np.stack([allot_evenly(spp, height, width, index) for index in range(count)])
+    return clip.frames._replace(radiance=clip.noisy[1] * counts, sample_count=counts)
 
 
 def common_layers(clips: Sequence[EvaluationClip]) -> list[int]:

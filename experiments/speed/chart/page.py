@@ -196,7 +196,7 @@ def _front(data: Mapping[str, Any], points: Sequence[Point], equals: Mapping[str
         rows.append(
             [
                 escape(point.method),
-                str(point.spp),
+                f"{point.spp:g}",
                 number(point.milliseconds(size, render=bool(data["render"]))),
                 number(point.denoise_ms.get(size, math.nan)),
                 *(number(point.errors[measure.field], 2) for measure in quality),
@@ -233,7 +233,7 @@ def _table(
         timing = data["times"].get(point.method, {}).get(sizes[0], {})
         equal = equals.get(point.key)
         spread = f"{number(timing['min_ms'])} – {number(timing['max_ms'])}" if timing else ""
-        row = [escape(point.method), str(point.spp or "time only")]
+        row = [escape(point.method), f"{point.spp:g}" if point.spp else "time only"]
         row += [
             number(point.errors.get(measure.field, math.nan), 4 if measure.better < 0 else 2) for measure in MEASURES
         ]

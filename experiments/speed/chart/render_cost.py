@@ -9,10 +9,14 @@ from experiments.speed.chart.energy import Meter
 from experiments.speed.timing import measure
 from jaxdn import effects
 from jaxdn.core.frame import OF_SAMPLES
+from jaxdn.ops.sampling import allot_evenly
 from jaxdn.render import AnimatedScene, render_frame
+from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.settings import RenderSettings
 
 SAMPLES = (1, 2, 4)
+FRACTIONS = (0.25, 0.5)
+"""Samples per pixel of frames with gaps."""
 FRAME = 2
 ROUNDS = 7
 
@@ -26,10 +30,13 @@ class Cost(NamedTuple):
     """One sample per pixel."""
     buffers: Mapping[str, float]
     """What a denoiser reads (:func:`named`) -> the buffers that the renderer makes for it."""
+    sparse: Mapping[str, float] = {}
+    """Less than one sample per pixel, as in "0.25" -> a frame of which so many pixels have one, without buffers."""
 
     def at(self, spp: float, reads: str = "") -> float:
         """The cost of a frame with ``spp`` samples and the buffers of a denoiser."""
-        return self.fixed + self.sample * spp + (self.buffers[reads] if reads else 0.0)
+        light = self.sparse.get(f"{spp:g}", self.fixed + self.sample * spp)
+        return light + (self.buffers[reads] if reads else 0.0)
 
 
 def named(reads: Collection[str]) -> str:
@@ -37,12 +44,13 @@ def named(reads: Collection[str]) -> str:
     return ", ".join(sorted(reads))
 
 
-def fit(light: Mapping[int, float], more: Mapping[str, float]) -> Cost:
+def fit(light: Mapping[int, float], more: Mapping[str, float], sparse: Mapping[str, float]) -> Cost:
     """The cost from the times of frames without buffers, ``light`` (samples -> time), and what buffers add to them."""
     samples = np.asarray(sorted(light), float)
     slope, fixed = np.polyfit(samples, [light[int(spp)] for spp in samples], 1)
     # Measurement noise must not make the cost of a buffer, or of the scene, negative.
-    return Cost(max(float(fixed), 0.0), max(float(slope), 0.0), {one: max(time, 0.0) for one, time in more.items()})
+    buffers = {one: max(time, 0.0) for one, time in more.items()}
+    return Cost(max(float(fixed), 0.0), max(float(slope), 0.0), buffers, sparse)
 
 
 def measure_cost(
@@ -63,14 +71,22 @@ def measure_cost(
             scene, FRAME, RenderSettings(width=width, height=height, layers=(spp,), plan=plan), previous=before
         )
 
+    def gaps(budget: float) -> Callable[[], Any]:
+        plan = everything._replace(frames=((),) * (FRAME + 1))
+        settings = RenderSettings(width=width, height=height, plan=plan)
+        counts = np.asarray(allot_evenly(budget, height, width, FRAME))
+        return lambda: render_sampled(scene, FRAME, lambda _: counts, settings, previous=before, sample_first=False)
+
     made = {one: [name for name in one.split(", ") if name in there and name in everything.buffers] for one in reads}
     calls = {f"light {spp}": frame(spp, ()) for spp in SAMPLES} | {"": frame(1, (), paths=False)}
+    calls |= {f"gaps {budget:g}": gaps(budget) for budget in FRACTIONS}
     calls |= {named(buffers): frame(1, buffers, paths=_paths(buffers)) for buffers in made.values()}
 
     def fitted(found: Mapping[str, float]) -> dict[str, Any]:
         base = {True: found["light 1"], False: found[""]}
         more = {one: found[named(buffers)] - base[_paths(buffers)] for one, buffers in made.items()}
-        return fit({spp: found[f"light {spp}"] for spp in SAMPLES}, more)._asdict()
+        sparse = {f"{budget:g}": found[f"gaps {budget:g}"] for budget in FRACTIONS}
+        return fit({spp: found[f"light {spp}"] for spp in SAMPLES}, more, sparse)._asdict()
 
     timings = measure(calls, rounds=ROUNDS, budget_s=120)
     costs = {"seconds": fitted({name: timing.median_ms / 1e3 for name, timing in timings.items()})}
@@ -87,5 +103,8 @@ def _paths(buffers: Collection[str]) -> bool:
 def mean_cost(costs: Sequence[Mapping[str, Any]]) -> Cost:
     """The mean over scenes."""
     fixed, sample = (float(np.mean([cost[name] for cost in costs])) for name in ("fixed", "sample"))
-    reads = costs[0]["buffers"]
-    return Cost(fixed, sample, {one: float(np.mean([cost["buffers"][one] for cost in costs])) for one in reads})
+    buffers, sparse = (
+        {one: float(np.mean([cost[name][one] for cost in costs])) for one in costs[0][name]}
+        for name in ("buffers", "sparse")
+    )
+    return Cost(fixed, sample, buffers, sparse)

@@ -46,6 +46,6 @@ class Store:
         return key in self.data[part]
 
 
-def point_key(method: str, spp: int) -> str:
+def point_key(method: str, spp: float) -> str:
     """The key of a point in the file."""
-    return f"{method} @ {spp}"
+    return f"{method} @ {spp:g}"

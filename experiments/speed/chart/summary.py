@@ -22,7 +22,7 @@ class Point(NamedTuple):
     variant: str
     reads: str
     """The buffers that it needs of the renderer besides radiance."""
-    spp: int | None
+    spp: float | None
     """None where only the time is known."""
     errors: Mapping[str, float]
     """Measure -> mean over clips."""
@@ -72,11 +72,11 @@ def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) 
             continue
         family, variant, reads = labels[method]
         errors = {measure.field: _mean([scores[measure.field] for scores in clips.values()]) for measure in MEASURES}
-        rendered = {size: 1e3 * cost.at(int(spp), reads) for size, cost in costs.items() if cost}
+        rendered = {size: 1e3 * cost.at(float(spp), reads) for size, cost in costs.items() if cost}
         times = {size: timing["median_ms"] for size, timing in data["times"].get(method, {}).items()}
         if method == RENDERER:
             times = dict.fromkeys(rendered, 0.0)
-        found.append(Point(key, method, family, variant, reads, int(spp), errors, times, rendered))
+        found.append(Point(key, method, family, variant, reads, float(spp), errors, times, rendered))
     scored = {point.method for point in found}
     for method, sizes in data["times"].items():
         if method not in scored and method in labels:
@@ -116,7 +116,7 @@ def pareto(points: Sequence[Point], measure: Measure, size: str, *, render: bool
     return front
 
 
-def equal_samples(psnr: float, curve: Mapping[int, float]) -> float:
+def equal_samples(psnr: float, curve: Mapping[float, float]) -> float:
     """Samples per pixel at which the renderer's ``curve`` (spp -> PSNR) reaches ``psnr``.
 
     Between two counts of samples the PSNR is linear in their logarithm. 0 below the curve's first point, infinite
@@ -124,7 +124,7 @@ def equal_samples(psnr: float, curve: Mapping[int, float]) -> float:
     """
     samples = np.asarray(sorted(curve), float)
     # More samples never make an image worse; where noise suggests it, the smaller number of samples counts.
-    quality = np.maximum.accumulate([curve[int(spp)] for spp in samples])
+    quality = np.maximum.accumulate([curve[spp] for spp in samples])
     if psnr < quality[0]:
         return 0.0
     if psnr > quality[-1]:
@@ -170,7 +170,7 @@ def front_table(
         rows.append(
             [
                 point.method,
-                str(point.spp),
+                f"{point.spp:g}",
                 f"{point.milliseconds(size, render=bool(point.render_ms)):.0f}",
                 f"{point.denoise_ms[size]:.0f}",
                 *(f"{point.errors[measure.field]:.2f}" for measure in quality),

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.speed.chart.render_cost import named
+from experiments.speed.chart.render_cost import FRACTIONS, named
 from experiments.speed.timing import Call
 from experiments.speed.works import steps
 from jaxdn.core.frame import BUFFERS, Frame, frame_at, only, written_out
@@ -46,6 +46,8 @@ class Way(NamedTuple):
     """Frames [T, H, W, C] -> images [T, H, W, 3]; None if only the time can be measured."""
     group: str
     """Methods of one group are timed interleaved."""
+    samples: tuple[float, ...] = DENOISED_SPP
+    """Samples per pixel of its points, ascending; below 1 of methods that take frames with gaps."""
 
 
 def as_it_is(frame: Frame, reads: frozenset[str]) -> Frame:
@@ -82,4 +84,6 @@ def way(candidate: Model, variant: str = PLAIN, *, prepare: Prepare = as_it_is, 
 
     family = candidate.label
     name = family if variant == PLAIN else f"{family}, {variant}"
-    return Way(name, family, variant, named(denoiser.reads), timed, images if scored else None, family)
+    sparse = candidate.method is not None and candidate.method.sparse
+    samples = (*FRACTIONS, *DENOISED_SPP) if sparse and variant == PLAIN else DENOISED_SPP
+    return Way(name, family, variant, named(denoiser.reads), timed, images if scored else None, family, samples)
