@@ -117,7 +117,7 @@ def _choose(
     result: Result, columns: Sequence[str] = (), rows: Sequence[str] = (), where: Mapping[str, Any] | None = None
 ) -> Result:
     """A part of a table: rows whose columns have the values ``where``, and whose "method" is one of ``rows``, in that
-    order."""
+    order in each group."""
     if result["kind"] != "table":
         return result
     names = [column["name"] for column in result["columns"]]
@@ -125,8 +125,9 @@ def _choose(
         row for row in result["rows"] if all(row[names.index(key)] == value for key, value in (where or {}).items())
     ]
     if rows:
-        methods = {row[names.index("method")]: row for row in kept}
-        kept = [methods[name] for name in rows]
+        group = names.index(result["group"]) if "group" in result else None
+        found = {(None if group is None else row[group], row[names.index("method")]): row for row in kept}
+        kept = [found[of, name] for of in dict.fromkeys(of for of, _ in found) for name in rows]
     places = [names.index(name) for name in columns or names]
     left_out = {"row_revisions"} | ({"group"} if result.get("group") not in (columns or names) else set())
     return {

@@ -36,6 +36,17 @@ PLAIN = "+no-safe"
 """Ending of a method that is run with ``--no-safe``."""
 ALONE = "oidn"
 """The method that sees one frame at a time."""
+IN_README = (
+    NOISY,
+    "svgf" + PLAIN,
+    "steady-balanced" + PLAIN,
+    "oidn" + PLAIN,
+    "oidn+prefiltered" + PLAIN,
+    "stabilised:oidn" + PLAIN,
+    "combiner-high",
+    "combiner-best" + PLAIN,
+)
+"""Those of the methods whose rows are in the README."""
 PREFILTERED = "+prefiltered"
 """Ending of Open Image Denoise that denoises the guides first, as Blender has it do by default."""
 
@@ -204,7 +215,8 @@ def means(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
         f"Scored: frames {', '.join(map(str, sorted({number for row in rows for number in row['frames']})))}."
     )
     described = {**_describe("Cycles test clips", 9, what, lines, options), "columns": columns, "group": "samples"}
-    return described if options.part else {**described, "readme": {}}
+    shown = [f"`{method}`" for method in IN_README if method in options.methods]
+    return described if options.part else {**described, "readme": {"rows": shown}}
 
 
 def kinds(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from experiments.cycles import compare
 from experiments.cycles import reference as references
 from experiments.cycles.reference import Reference, compress
 from experiments.cycles.score import Scored, find_changed, find_edges, score
-from experiments.results_page import read_results, results_page
+from experiments.results_page import read_results, readme_block, results_page
 from jaxdn.clips import write_exr
 
 SIZE = (96, 128)
@@ -187,6 +187,17 @@ def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     assert part["command"].endswith("--methods noisy --spp 4 --part 'few samples'")
     assert "readme" in results["quality-cycles-test.json"]
     assert "readme" not in part
+
+
+def test_the_readme_has_a_few_methods_of_every_sample_count() -> None:
+    methods = ["noisy", "combiner-high+no-safe", "combiner-high"]
+    figures = dict.fromkeys(compare.FIGURES, 30.0)
+    facts = {"clip": "sun-9000", "kind": "sun", "frames": [2, 3], **figures}
+    rows = [{"spp": spp, "method": method, **facts} for spp in (1, 4) for method in methods]
+    found = compare.means(rows, compare.Options(Path("test"), methods=methods, spp=[1, 4]))
+    lines = [line.split("|")[1:3] for line in readme_block([found]).splitlines() if "`" in line and line[0] == "|"]
+    shown = [(int(spp), name.strip()) for spp, name in lines]
+    assert shown == [(spp, f"`{method}`") for spp in (1, 4) for method in ("noisy", "combiner-high")]
 
 
 @pytest.mark.slow
