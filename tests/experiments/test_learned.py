@@ -25,6 +25,7 @@ from experiments.papers.learned import (
     zeng_ablation,
     zeng_methods,
 )
+from experiments.papers.learned.record import record_table
 from experiments.results_page import read_results, results_page
 from jaxdn import denoisers
 from jaxdn.core.frame import Frame
@@ -193,6 +194,10 @@ def test_the_loss_of_a_family_is_that_of_its_own_clips(monkeypatch: pytest.Monke
     assert "| mobile | 30.90 | 30.50 | 30.10 | 0.80 |" in ntasd_holdout.text(found)
     (claim,) = ntasd_holdout.claims(found)
     assert (claim.ours, claim.holds) == ("0.20 to 0.80 dB", False)
+    recorded = record_table(ntasd_holdout.TABLE, found, stages.Settings(tables=["ntasd_holdout"]))
+    assert recorded["columns"][0] == {"name": "family", "decimals": 2}
+    assert recorded["rows"] == [["parlour", 28.7, 29.5, 28.5, 0.2], ["mobile", 30.9, 30.5, 30.1, 0.8]]
+    assert "| mobile | 30.90 | 30.50 | 30.10 | 0.80 |" in results_page([recorded | {"file": "holdout.json"}])
 
 
 def test_the_ladder_is_climbed_step_by_step() -> None:

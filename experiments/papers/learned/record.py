@@ -23,29 +23,43 @@ COLUMNS: Mapping[str, tuple[Callable[[Scores], float], int, str]] = {
 }
 """Title of a column -> its value, the decimals, what is best."""
 _ORDER, _CURVES_ORDER = 71.0, 72.0
+_Made = tuple[list[dict[str, Any]], list[list[Any]], str]
+"""Columns, rows, and what the rows are."""
 
 
 def record_table(one: Table, found: Results, settings: Settings) -> dict[str, Any]:
-    """The scores of a table's rows, means over the test clips, with what holds of the paper's claims as notes."""
-    means = mean_scores(rows_of(found, one.rows))
-    rows = [
-        [f"`{label}`", *(_round(value(scores), decimals) for value, decimals, _ in COLUMNS.values())]
-        for label, scores in means.items()
-    ]
-    what = (
-        f"Means over {len(found.clips)} test clips of other seeds. {_describe(settings)} "
-        "All columns but SSIM and FLIP are without the references' noise."
-    )
-    columns = [{"name": title, "decimals": decimals, "best": best} for title, (_, decimals, best) in COLUMNS.items()]
+    """A table as a measurement, with what holds of the paper's claims as notes."""
+    columns, rows, what = _scores_of(one, found) if one.figures is None else _figures_of(one.figures(found))
+    what = f"{what} {_describe(settings)}"
     title = one.heading + (", as published" if settings.as_published else "")
     described = describe_measurement(
         "table", title, "Quality", _ORDER, command=_command(settings), what=what, rows=rows
     )
     return {
         **described,
-        "columns": [{"name": "method"}, *columns],
+        "columns": columns,
         "notes": [_tell(claim) for claim in one.claims(found)],
     }
+
+
+def _scores_of(one: Table, found: Results) -> _Made:
+    """A row a method, its means over the test clips."""
+    rows = [
+        [f"`{label}`", *(_round(value(scores), decimals) for value, decimals, _ in COLUMNS.values())]
+        for label, scores in mean_scores(rows_of(found, one.rows)).items()
+    ]
+    columns = [{"name": title, "decimals": decimals, "best": best} for title, (_, decimals, best) in COLUMNS.items()]
+    what = (
+        f"Means over {len(found.clips)} test clips of other seeds, but for SSIM and FLIP without the references' noise."
+    )
+    return [{"name": "method"}, *columns], rows, what
+
+
+def _figures_of(figures: Sequence[Mapping[str, str | float]]) -> _Made:
+    """A table's own rows, all of PSNR."""
+    rows = [[value if isinstance(value, str) else round(value, 2) for value in row.values()] for row in figures]
+    columns = [{"name": title, "decimals": 2} for title in figures[0]]
+    return columns, rows, "PSNR in dB on test clips of other seeds, without the references' noise."
 
 
 def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: Settings) -> dict[str, Any]:

@@ -41,6 +41,8 @@ class Table(NamedTuple):
     """Samples a pixel of what the methods are given."""
     budgets: bool = False
     """Whether the methods differ by their samples a pixel."""
+    figures: Callable[[Results], list[dict[str, str | float]]] | None = None
+    """The rows of the page of results, column -> value; None: the scores of all methods."""
 
     @property
     def heading(self) -> str:
