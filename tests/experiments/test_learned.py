@@ -23,6 +23,7 @@ from experiments.papers.learned import (
     scores,
     stages,
     zeng_ablation,
+    zeng_changes,
     zeng_methods,
 )
 from experiments.papers.learned.record import record_table
@@ -128,7 +129,8 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
 def test_every_stage_is_a_network_of_its_method() -> None:
     for name, stage in stages.STAGES.items():
         row = method_named(stage.method)
-        assert row.recipe_named(stage.recipe).objective.name == stages.objective_of(name)
+        objective = stage.objective or row.recipe_named(stage.recipe).objective
+        assert stages.objective_of(name) == objective.name
         asking = row.factory(**stage.options).samples is not None
         assert asking == row.has_option("budget"), name
 
@@ -267,6 +269,18 @@ def test_each_budget_has_its_own_ratio() -> None:
     assert claims["chosen / uniform, relative MSE, 4 samples"] == ("0.66 to 0.75", "1.00", False)
     assert "| 0.25 | 0.50 | 0.25 | +0.00 dB | 0.0 |" in ntasd_budgets.text(found)
     assert ntasd_budgets.TABLE.heading == "Samples where they pay, by budget"
+
+
+def test_changes_of_ours_are_added_to_the_papers_settings_one_by_one() -> None:
+    paper, *single, every = (stages.STAGES[row] for row in zeng_changes.ROWS)
+    assert paper.options == {"preset": "paper", "size": "small"}
+    assert len(single) == len(stages.CHANGES) == 4
+    changed = [set(one.options.items()) ^ set(paper.options.items()) for one in single]
+    assert changed == [{("kernels", "guided")}, {("demodulate", "brdf")}, set(), {("initialization", "he")}]
+    assert [one.objective is not None for one in (paper, *single, every)] == [False, False, False, True, False, True]
+    assert every.options == paper.options | {"kernels": "guided", "demodulate": "brdf", "initialization": "he"}
+    assert {one.recipe for one in (paper, *single, every)} == {"paper-loss"}
+    assert scores.objective_of(zeng_changes.ALL) != scores.objective_of(zeng_changes.BASE)
 
 
 def test_as_published_is_the_preset_with_what_a_stage_is_for() -> None:

@@ -19,6 +19,7 @@ from experiments.papers.learned import (
     ntasd_sizes,
     rae_methods,
     zeng_ablation,
+    zeng_changes,
     zeng_methods,
 )
 from experiments.papers.learned.curves import make_table, measure_curves
@@ -34,7 +35,16 @@ from jaxdn.runtime.atomic_files import write_json
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE
-    for file in (ntasd_methods, ntasd_budgets, ntasd_holdout, ntasd_sizes, rae_methods, zeng_methods, zeng_ablation)
+    for file in (
+        ntasd_methods,
+        ntasd_budgets,
+        ntasd_holdout,
+        ntasd_sizes,
+        rae_methods,
+        zeng_methods,
+        zeng_ablation,
+        zeng_changes,
+    )
 }
 REFERENCES = ("noisy", "svgf", "steady-balanced")
 """In every run, whatever the tables."""

@@ -10,6 +10,7 @@ from experiments.papers.preintegration import file_name
 from jaxdn.clips import find_clips
 from jaxdn.denoisers import taa
 from jaxdn.methods.registry import is_method, method_named
+from jaxdn.recipes.objectives import Objective, unbiased_illumination
 from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import ClipSource, render
 from jaxdn.training.train import train
@@ -43,6 +44,8 @@ class Stage(NamedTuple):
     """Samples a pixel of what it is trained on, if it asks for none."""
     start: str | None = None
     """The stage whose weights are its first ones; None: new weights."""
+    objective: Objective | None = None
+    """Instead of the recipe's."""
 
 
 _EVEN = {"size": "small", "adaptive": False}
@@ -75,6 +78,31 @@ def _budget_stages() -> Iterator[tuple[str, Stage]]:
             yield stage_of_budget(kind, budget), Stage("ntasd", options, recipe="paper", start=start)
 
 
+CHANGES: dict[str, dict[str, Any]] = {
+    "guided kernels": {"options": {"kernels": "guided"}},
+    "F_b": {"options": {"demodulate": "brdf"}},
+    "our loss": {"objective": unbiased_illumination()},
+    "He's weights": {"options": {"initialization": "he"}},
+}
+"""Where the defaults of ``ntd`` differ from Zeng et al. 2021 -> what of a stage it changes."""
+
+
+def stage_of_changes(changes: Sequence[str]) -> str:
+    """The name of a stage that differs from the paper in these."""
+    return ", ".join(["ntd of the paper", *changes])
+
+
+def _changed_stages() -> Iterator[tuple[str, Stage]]:
+    """The paper's settings, each of our changes on top of them, and all of them."""
+    for chosen in ((), *((change,) for change in CHANGES), tuple(CHANGES)):
+        options: dict[str, Any] = {"preset": "paper", "size": "small"}
+        objective = None
+        for change in chosen:
+            options |= CHANGES[change].get("options", {})
+            objective = CHANGES[change].get("objective", objective)
+        yield stage_of_changes(chosen), Stage("ntd", options, recipe="paper-loss", spp=1, objective=objective)
+
+
 _SINGLE_FRAMES = {**_EVEN, "history": "none"}
 _UNIFORM = Stage("ntasd", _EVEN, recipe="paper")
 _WITHOUT = "paper-loss-without-occlusion"
@@ -98,6 +126,7 @@ STAGES = {
     **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
     **{f"ntasd, uniform, only {family}": _UNIFORM._replace(only=family) for family in HELD_OUT},
     **dict(_budget_stages()),
+    **dict(_changed_stages()),
 }
 """Each by the loss of its paper; those that Hasselgren et al. compare all by theirs."""
 
@@ -201,6 +230,8 @@ def _weights_of(name: str, settings: Settings) -> Path:
     )
     if not settings.as_published:
         recipe = recipe._replace(average=0.99)
+    if stage.objective is not None:
+        recipe = recipe._replace(objective=stage.objective)
     start = None if stage.start is None else str(_weights_of(stage.start, settings))
     clips = clips_of(stage, find_clips(settings.data / "train"))
     out = settings.results / file_name(name)
@@ -218,4 +249,5 @@ def objective_of(name: str) -> str:
     name = name.removesuffix(AFTERWARDS)
     if name not in STAGES:
         return ""
-    return method_named(STAGES[name].method).recipe_named(STAGES[name].recipe).objective.name
+    stage = STAGES[name]
+    return (stage.objective or method_named(stage.method).recipe_named(stage.recipe).objective).name
