@@ -90,6 +90,8 @@ weight of the new frame in the mean, and of the new image in the last output; th
 resolution; the weight of the filtered light in the mean."""
 _SPLITS = np.cumsum([4 * FEATURES, 4 * len(INITIAL), HALF_FEATURES]).tolist()
 """Channels of the head from which on it says something else."""
+FILLED_SAMPLES = 0.1
+"""Effective number of samples of light that is that of neighbours."""
 _LEVEL_WEIGHT, _REGRESSION_WEIGHT = 4.0, 3.0
 """Initial logits of the weights of each level at half resolution, and of the regression."""
 PRECISIONS = {"albedo": 1.0, "gloss": 2.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
@@ -170,12 +172,15 @@ def steady(options: Options) -> Denoiser:
         history = reproject(state.history, state.guides, frame, first)
         past = History(pad(history.history, BLOCKS), pad(history.valid, BLOCKS)[..., 0])
         # What was not measured is as it was: no light would be taken for a lamp that is switched off.
-        unmeasured = hit & ~known & past.valid
-        noisy = jnp.where(unmeasured[..., None], past.values[..., :3], noisy)
+        unmeasured = hit & ~known
+        noisy = jnp.where((unmeasured & past.valid)[..., None], past.values[..., :3], noisy)
         weights = {name: part for name, part in params.items() if name != "guide"}
         head = network.apply(weights, [_network_input(noisy, past, surfaces, statistics)[None]])[0][0]
         parameters, shares = split_heads(head, (hit.shape[0] // 2, hit.shape[1] // 2))
-        mean = update_mean(noisy, past, hit, shares["accumulation"], most=options.history_max)
+        follow = jnp.where(unmeasured, 0.0, shares["accumulation"])
+        mean = update_mean(noisy, past, hit, follow, most=options.history_max)
+        guessed = unmeasured & ~past.valid
+        mean = mean._replace(sample_count=jnp.where(guessed, FILLED_SAMPLES, mean.sample_count))
         texture = find_texture_left(frame, options.demodulate, statistics)
         texture = None if texture is None else fill_holes(pad(texture, BLOCKS), hit[..., None])
         residual = mean.residual if quality.lighting_change else None

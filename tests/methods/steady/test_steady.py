@@ -13,6 +13,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads, steady
+from jaxdn.ops.sampling import allot_evenly
 from jaxdn.ops.scales import space_to_depth
 from tests.gradients import check_gradients
 from tests.methods.steady.short import TINY, short_steady
@@ -178,6 +179,19 @@ def test_invalid_pixels_of_the_first_frame_are_filled_from_their_neighbours(rng,
     flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=jnp.ones_like(frames.albedo))
     broken = flat._replace(radiance=flat.radiance.at[0].set(jnp.where(invalid, jnp.nan, flat.radiance[0])))
     np.testing.assert_allclose(denoised(broken, key=key), flat.radiance, rtol=1e-4)
+
+
+def test_a_sample_in_every_fourth_frame_counts_as_much_as_one_in_every_frame(rng):
+    """Frames between, in which a pixel has none, neither hold its mean back nor make it surer."""
+    size = (96, 160)
+    frames = room(rng, 16, size=size)
+    every = jax.tree.map(lambda leaf: leaf[:4], frames)
+    counts = np.stack([np.asarray(allot_evenly(0.25, *size, index)) for index in range(16)])
+    fourth = frames._replace(radiance=frames.radiance * counts, sample_count=jnp.asarray(counts))
+    whole, sparse = (
+        jnp.mean(jnp.square(denoised(each, sharper=8.0)[-1] / each.albedo[0] - 1.0)) for each in (every, fourth)
+    )
+    assert sparse < 1.5 * whole
 
 
 @pytest.mark.slow
