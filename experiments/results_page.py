@@ -127,6 +127,8 @@ def _choose(
     if rows:
         group = names.index(result["group"]) if "group" in result else None
         found = {(None if group is None else row[group], row[names.index("method")]): row for row in kept}
+        if absent := sorted({(of, name) for of, _ in found for name in rows} - found.keys(), key=str):
+            raise ValueError(f"{result['title']}: expected the rows that its readme names, found none of {absent}.")
         kept = [found[of, name] for of in dict.fromkeys(of for of, _ in found) for name in rows]
     places = [names.index(name) for name in columns or names]
     left_out = {"row_revisions"} | ({"group"} if result.get("group") not in (columns or names) else set())

@@ -310,8 +310,8 @@ class Denoise:
     """Backend for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
     onednn-float32 (CPUs; the extra onednn), onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
     budget: float | None = None
-    """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean. These methods
-    take less than 1, and so does steady for a scene. Default: the method's own, else 4."""
+    """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean. Less than 1:
+    for ntasd trained with least=0, and for a scene with steady. Default: the method's own, else 4."""
     width: int | None = None
     """For a scene: the width in pixels; default: that of `jaxdn render`."""
     height: int | None = None

@@ -33,7 +33,8 @@ def export(
     Args:
       name: of a filter, shipped weights, or the path of a .safetensors file.
       out: a folder, made if it is missing.
-      buffers: those that frames will have besides ``radiance``; None: all that the method reads.
+      buffers: those that frames will have besides ``radiance``; None: all that the method reads
+        (:func:`jaxdn.export.step.exported_step`).
       size: height and width; None: any.
       format: what is written.
       progress: called with what is being done.

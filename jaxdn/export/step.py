@@ -46,7 +46,8 @@ def exported_step(
     Args:
       denoiser: any.
       params: its parameters, constants of the program.
-      buffers: those that frames will have besides ``radiance``; None: all that the denoiser reads.
+      buffers: those that frames will have besides ``radiance``; None: all that the denoiser reads, without
+        ``sample_count`` unless it asks for samples: every pixel of a frame that was rendered in the usual way has some.
       size: height and width; None: any.
 
     Raises ValueError for buffers that the denoiser does not read, and where a program for any size, or any program that
@@ -75,7 +76,8 @@ def name_buffer_channels(buffer: str) -> list[str]:
 
 def _chosen(denoiser: Denoiser, buffers: Collection[str] | None) -> list[str]:
     """The buffers of the frames, in the order of the table. Raises ValueError for unknown ones."""
-    chosen = denoiser.reads if buffers is None else set(buffers) - {"radiance"}
+    usual = denoiser.reads - (frozenset() if denoiser.samples else {"sample_count"})
+    chosen = usual if buffers is None else set(buffers) - {"radiance"}
     if unknown := sorted(set(chosen) - denoiser.reads):
         raise ValueError(
             f"--buffers: expected some of {', '.join(sorted(denoiser.reads))}, which this method reads, got "

@@ -128,18 +128,19 @@ def draw_random_numbers(height: int, width: int, frame: jax.Array | int) -> jax.
 def rotate_pattern(height: int, width: int, frame: jax.Array | int) -> jax.Array:
     """Numbers [H, W, 1] in [0, 1) for a frame, in place of :func:`draw_random_numbers`: a fixed pattern that rotates.
 
-    The binary digits of the ordered dither of 4x4 pixels (Bayer 1973), each flipped where the frame's number has a 1,
-    its lowest digit the first. With budgets of ``2^-n`` samples a pixel, ``round_stochastically`` gives every pixel one
-    sample in each run of ``2^n`` frames that begins at a multiple of it. Of a half, the pixels are a checkerboard in
-    every frame; of a quarter, each aligned 2x2 block has one.
+    The binary digits of the ordered dither (Bayer 1973), each flipped where the frame's number has a 1, its lowest
+    digit the first. With budgets of ``2^-n`` samples a pixel, ``round_stochastically`` gives every pixel one sample in
+    each run of ``2^n`` frames that begins at a multiple of it. Of a half, the pixels are a checkerboard in every frame;
+    of a quarter, each aligned 2x2 block has one. Any other budget is that of every frame, up to what its borders cut
+    off: the dither has as many digits as the sides of 65,536 pixels.
     """
     rows, columns = (jnp.arange(size, dtype=jnp.uint32) for size in (height, width))
     order = jnp.zeros((height, width), jnp.uint32)
-    for bit in (0, 1):
+    for bit in range(16):
         row, column = (rows[:, None] >> bit) & 1, (columns[None] >> bit) & 1
         # 0 and 1 on the diagonal, 2 and 3 beside it.
         order = 4 * order + 2 * (row ^ column) + row
-    return _fraction((order << 28) ^ _reverse_digits(jnp.asarray(frame).astype(jnp.uint32)))[..., None]
+    return _fraction(order ^ _reverse_digits(jnp.asarray(frame).astype(jnp.uint32)))[..., None]
 
 
 def allot_evenly(budget: float, height: int, width: int, frame: jax.Array | int) -> jax.Array:

@@ -148,13 +148,19 @@ class FrameDenoiser:
         return self._sanitized + (0 if self._step is None else self._step.sanitized)
 
     def blend_fallback(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Fallback]:
-        """The image of the last frame with what is no noise as it was, and why (:mod:`jaxdn.sequence.james_stein`)."""
+        """The image of the last frame with what is no noise as it was, and why (:mod:`jaxdn.sequence.james_stein`).
+
+        Pixels without samples have nothing to keep.
+        """
         noisy = np.asarray(frame.radiance)
+        if frame.sample_count is not None:
+            noisy = np.where(np.asarray(frame.sample_count) > 0, noisy, np.float32(np.nan))
         combined = self._combine(noisy, image, None if frame.depth is None else np.asarray(frame.depth) < FAR)
         confidence: Confidence = jax.device_get(_measure_confidence(combined))
         image = np.asarray(combined.image)
         if confidence.fallback > 0:
-            image = image + np.float32(confidence.fallback) * (np.asarray(light_of(noisy)) - image)
+            kept = np.where(np.isfinite(noisy), noisy, image)
+            image = image + np.float32(confidence.fallback) * (kept - image)
         image = restore_lamps(image, noisy, self._lamps)
         texture_unknown = frame.albedo is None and frame.reflectance is None
         return image, Fallback(confidence, float(np.mean(np.asarray(combined.noisy_weight))), texture_unknown)

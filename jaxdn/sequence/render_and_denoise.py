@@ -1,5 +1,6 @@
 """``jaxdn denoise SCENE``: render and denoise frame by frame, with samples where the denoiser wants them."""
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
@@ -37,7 +38,7 @@ class SceneSettings(NamedTuple):
     frames: Collection[int] | None = None
     """Numbers of the frames to denoise; None: all of the scene."""
     budget: float = 4.0
-    """Mean number of samples per pixel; below 1, most pixels of a frame have none."""
+    """Mean number of samples per pixel; below 1, not every pixel of a frame has one."""
     preview: bool = False
     """Write a PNG next to each frame, and one of its samples."""
 
@@ -113,11 +114,11 @@ def denoise_scene(
 def _check_even_budget(budget: float, method: Model) -> None:
     """Raise ValueError for a budget that cannot be the same everywhere, of a method that does not say otherwise."""
     sparse = method.method is not None and method.method.sparse
-    if sparse and not 0 < budget <= MOST:
-        raise ValueError(f"--budget {budget:g}: expected a number of samples above 0 up to {MOST}.")
+    if sparse and not 0 < budget < math.inf:
+        raise ValueError(f"--budget {budget:g}: expected a number of samples above 0.")
     if not sparse and (budget < 1 or budget % 1):
         able = ", ".join(each.name for each in methods().values() if each.sparse)
         raise ValueError(
             f"--budget {budget:g}: expected a whole number of at least 1, as {method.label} does not say where samples "
-            f"go; fractions are for methods that do (ntasd, dasr), and for {able}."
+            f"go; fractions are for {able}, and for weights of methods that do (ntasd, dasr)."
         )

@@ -20,7 +20,7 @@ from jaxdn.core.frame import BUFFERS, Clip, frame_at, written_out
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.export.formats import onnx_model
-from jaxdn.export.step import ExportedStep
+from jaxdn.export.step import ExportedStep, exported_step
 from jaxdn.zoo.ready import find_model
 from tests.needs import require, require_module
 from tests.training.test_training import make_clip
@@ -118,6 +118,15 @@ def test_absent_buffers_are_no_inputs(tmp_path):
     assert list(done.step.inputs) == ["radiance", "motion", "state.history", "first"]
     frames = moving_clip(2, 20).frames._replace(depth=None)
     assert_same(run_onnx(done.files[0], frames, 2), expected("taa", frames, 2))
+
+
+def test_the_number_of_samples_is_an_input_where_it_is_asked_for(tmp_path):
+    """Frames that were rendered in the usual way do not say it."""
+    denoiser = jaxdn.stabilised(jaxdn.denoisers.taa())
+    assert "sample_count" in denoiser.reads
+    assert "sample_count" not in exported_step(denoiser, {}, size=(16, 16)).inputs
+    asked = exported_step(denoiser, {}, size=(16, 16), buffers=["sample_count", "motion"])
+    assert list(asked.inputs)[:3] == ["radiance", "motion", "sample_count"]
 
 
 @pytest.mark.slow

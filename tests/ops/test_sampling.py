@@ -223,7 +223,13 @@ def test_a_rotating_pattern_is_spread_evenly_in_every_frame():
     assert (half[:, 1:] != half[:, :-1]).all()
     assert (half[:, :, 1:] != half[:, :, :-1]).all()
     # Sixteen thresholds, each in every 4x4 block.
-    assert sorted(16 * numbers[0, :4, 4:8].ravel()) == list(range(16))
+    assert sorted(np.floor(16 * numbers[0, :4, 4:8].ravel())) == list(range(16))
+
+
+@pytest.mark.parametrize("budget", [0.004, 0.05, 0.1, 0.2, 1 / 3, 0.7, 2.3])
+def test_even_samples_are_any_budget_in_the_mean_of_every_frame(budget):
+    means = [float(jnp.mean(allot_evenly(budget, 90, 160, index))) for index in (0, 1, 2, 3, 17, 100)]
+    np.testing.assert_allclose(means, budget, atol=0.003)
 
 
 @pytest.mark.parametrize("budget", [0.25, 0.5, 1.0, 2.5, 4.0])

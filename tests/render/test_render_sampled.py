@@ -220,8 +220,8 @@ def test_what_cannot_be_rendered_is_told(wrong, weights, tmp_path, capsys):
     ("method", "budget", "words"),
     [
         ("svgf", "2.5", "expected a whole number of at least 1, as svgf"),
-        ("svgf", "0", "fractions are for methods that do (ntasd, dasr), and for steady."),
-        ("steady-fast", "0", "expected a number of samples above 0 up to 64."),
+        ("svgf", "0", "fractions are for steady, and for weights of methods that do (ntasd, dasr)."),
+        ("steady-fast", "0", "expected a number of samples above 0."),
     ],
 )
 def test_what_a_method_that_does_not_ask_cannot_have(method, budget, words, tmp_path, capsys):

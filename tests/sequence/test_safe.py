@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from jaxdn import clips, color
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.metrics import psnr
+from jaxdn.ops.sampling import allot_evenly
 from jaxdn.render import ClipJob, render_clips
 from jaxdn.render.settings import RenderSettings
-from jaxdn.sequence.frame_denoiser import Fallback
+from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.james_stein import Confidence
 from jaxdn.sequence.missing_motion import MEASURED
 from jaxdn.sequence.run import denoise_files
@@ -79,6 +82,19 @@ def test_no_frame_is_worse_than_it_was(tmp_path: Path, samples: int) -> None:
     plain, safe = (decibels(denoise(source, tmp_path / str(on), safe=on)[0]) for on in (False, True))
     assert all(now > then for now, then in zip(safe, before, strict=True))
     assert all(now > then - 0.02 for now, then in zip(safe, plain, strict=True))
+
+
+def test_pixels_without_samples_keep_nothing(rng: np.random.Generator) -> None:
+    """There the image is the denoiser's; what little noise there is elsewhere has most of the frame kept."""
+    truth = picture(0)
+    seen = np.asarray(allot_evenly(0.5, *SIZE, 0))
+    frame = Frame((truth * rng.gamma(400, 1 / 400, truth.shape) * seen).astype(np.float32), sample_count=seen)
+    denoiser = FrameDenoiser(share_model("taa"), Path("shot"), channels=lambda: 3, log=lambda line: None)
+    denoiser(StoredFrame(frame))
+    image, fallback = denoiser.blend_fallback(frame, 0.9 * truth)
+    assert fallback.kept > 0.2
+    unseen = seen[..., 0] == 0
+    np.testing.assert_allclose(image[unseen], 0.9 * truth[unseen], rtol=0.15)
 
 
 def test_a_frame_with_little_noise_that_is_kept_blames_no_guides() -> None:

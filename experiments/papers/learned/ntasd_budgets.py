@@ -2,7 +2,8 @@
 
 Hasselgren et al. 2020 report 0.66 to 0.75 of the relative MSE of uniform sampling, at four samples. Below one sample a
 pixel a network chooses which pixels get one. It is compared with pixels at random and, for budgets below one, with a
-fixed pattern that rotates from frame to frame. Each network is trained with its own budget.
+fixed pattern that rotates from frame to frame. Each network is trained with its own budget, from that of the next
+larger one: at equal budgets all have had as many updates, at smaller budgets more.
 """
 
 from typing import Any

@@ -8,7 +8,7 @@ from experiments.cycles.reference import decibels
 from experiments.measurement import describe_measurement
 from experiments.papers.learned.curves import METRICS, PICTURE, choose_frames, find_mean
 from experiments.papers.learned.scores import Claim, Table, rows_of
-from experiments.papers.learned.stages import FAMILIES, Settings
+from experiments.papers.learned.stages import FAMILIES, STAGES, Settings
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import Scores, mean_scores
 
@@ -31,6 +31,8 @@ def record_table(one: Table, found: Results, settings: Settings) -> dict[str, An
     """A table as a measurement, with what holds of the paper's claims as notes."""
     columns, rows, what = _scores_of(one, found) if one.figures is None else _figures_of(one.figures(found))
     what = f"{what} {_describe(settings)}"
+    if any(STAGES[row].start for row in one.rows if row in STAGES):
+        what += " Networks of smaller budgets go on from those of the next larger one and so have had more updates."
     title = one.heading + (", as published" if settings.as_published else "")
     described = describe_measurement(
         "table", title, "Quality", _ORDER, command=_command(settings), what=what, rows=rows

@@ -182,19 +182,21 @@ def test_invalid_pixels_of_the_first_frame_are_filled_from_their_neighbours(rng,
 
 
 def test_a_sample_in_every_fourth_frame_counts_as_much_as_one_in_every_frame(rng):
-    """Frames between, in which a pixel has none, do not make its mean surer."""
+    """Frames between, in which a pixel has none, do not make its mean surer, and do not darken its image."""
     denoiser, frame = tiny(demodulate="none"), frame_at(room(rng, 1), 0)
     params, state = denoiser.init(jax.random.key(0), frame), denoiser.start({}, frame)
     params["head_0"]["kernel"] = 0.0 * params["head_0"]["kernel"]
     step, numbers = jax.jit(denoiser.step), []
     for index in range(16):
         counts = allot_evenly(0.25, *SIZE, index)
-        state, _ = step(params, state, frame._replace(radiance=frame.radiance * counts, sample_count=counts))
+        state, image = step(params, state, frame._replace(radiance=frame.radiance * counts, sample_count=counts))
         numbers.append(np.asarray(state.core.history[..., 4]))
     assert numbers[-1].min() > 3.0
     assert numbers[-1].max() < 4.3
     none = np.asarray(counts)[..., 0] == 0
     np.testing.assert_array_equal(numbers[-1][none], numbers[-2][none])
+    light = np.asarray(image / frame.albedo)[..., 1]
+    assert light[none].mean() == pytest.approx(light[~none].mean(), rel=0.1)
 
 
 @pytest.mark.slow
