@@ -85,7 +85,7 @@ def page(
     }
     denoised = [error for maps in errors.values() for key, error in maps.items() if not key.startswith(RENDERER)]
     scale = images.error_scale(denoised or [np.zeros((1, 1))])
-    most = max((point.spp or 0 for point in points if point.method == RENDERER), default=0)
+    most = max((int(point.spp or 0) for point in points if point.method == RENDERER), default=0)
     content = {
         "measures": [each._asdict() for each in sorted(MEASURES, key=lambda each: each != headline(points)[0])],
         "sizes": sizes,
