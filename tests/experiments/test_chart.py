@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import tyro
 
+from experiments.results_page import results_page
 from experiments.speed.chart import __main__ as chart
 from experiments.speed.chart import render_cost, stacks
 from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
 from experiments.speed.chart.footage import EvaluationClip, noisy_frames
 from experiments.speed.chart.page import page
+from experiments.speed.chart.record import Measured, record_front
 from experiments.speed.chart.render_cost import Cost, fit, mean_cost, measure_cost
 from experiments.speed.chart.scores import MEASURES, score
 from experiments.speed.chart.store import Store, point_key
@@ -32,7 +34,7 @@ from experiments.speed.chart.summary import (
     points,
 )
 from experiments.speed.chart.way import way
-from experiments.speed.chart.ways import chosen, left_out, registered, ways
+from experiments.speed.chart.ways import chosen, left_out, registered, select_ways, ways
 from experiments.speed.timing import Timing
 from experiments.speed.works import scene
 from experiments.speed.works.stages import measure_stages
@@ -240,6 +242,29 @@ def test_stages_are_those_of_real_files():
     taken = measure_stages("taa", (32, 48), frames=3)
     assert all(ms > 0 for ms in taken)
     assert taken.starting > taken.reading + taken.denoising + taken.writing
+
+
+def test_the_front_is_recorded_for_the_page_of_results(data):
+    data["errors"][point_key("filter", 0.5)] = {"room": scores(23)}
+    for costs in data["render"][SIZE].values():
+        costs["seconds"]["sparse"] = {"0.5": 0.2}
+    found = points(data, LABELS)
+    front, quality = pareto(found, PSNR, SIZE), headline(found)
+    recorded = record_front(front, equal_quality(found, None), quality, Measured(1, OWN, SIZE, 8, ["filter"]))
+    assert recorded["command"] == "python -m experiments.speed.chart --methods filter"
+    rows = {(row[0], row[1]): row[2:] for row in recorded["rows"]}
+    assert rows["`filter`", "0.5"][:3] == [(30 + 200 + 250), 30, 23.0]
+    assert rows["the renderer alone", "8"][1] is None
+    page = results_page([recorded | {"file": "front.json"}])
+    assert "| `filter` | 0.5 | 480 | 30 |" in page
+
+
+def test_rows_that_are_not_there_are_told(denoisers):
+    listed = list(registered(denoisers))
+    assert [each.name for each in select_ways(listed, [listed[1].name])] == [listed[1].name]
+    assert select_ways(listed, []) == listed
+    with pytest.raises(ValueError, match="got nothing such"):
+        select_ways(listed, ["nothing such"])
 
 
 def test_the_fit_gives_back_the_cost():

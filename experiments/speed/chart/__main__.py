@@ -3,9 +3,11 @@
     python -m experiments.speed.chart                          # everything, about 20 minutes on two cores
     python -m experiments.speed.chart --quick                  # the fastest of each method, one tiny clip: a minute
     python -m experiments.speed.chart --clips my/clip other    # your own clips (with layers and a reference)
+    python -m experiments.speed.chart --methods taa "steady-fast, onednn-bfloat16"      # some rows alone
 
-Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`` (a page that needs no network). Every
-point is saved when it is measured: an interrupted run is resumed and measures only what is missing.
+Writes ``runs/chart/chart.json`` (raw measurements), ``runs/chart/chart.html`` (a page that needs no network), and the
+front as ``runs/chart/speed-error-against-time.json``, in the format of docs/results. Every point is saved when it is
+measured: an interrupted run is resumed and measures only what is missing.
 """
 
 import gc
@@ -30,12 +32,13 @@ from experiments.speed.chart.breakdown import breakdown, subjects
 from experiments.speed.chart.energy import NOT_MEASURABLE, Meter, find_meter
 from experiments.speed.chart.footage import EvaluationClip, Sizes
 from experiments.speed.chart.page import write_page
+from experiments.speed.chart.record import Measured, record_front
 from experiments.speed.chart.render_cost import FRACTIONS, measure_cost
 from experiments.speed.chart.scores import MEASURES, picture, score
 from experiments.speed.chart.store import Store, point_key
 from experiments.speed.chart.summary import RENDERER
 from experiments.speed.chart.way import Way
-from experiments.speed.chart.ways import chosen, left_out, ways
+from experiments.speed.chart.ways import chosen, left_out, select_ways, ways
 from experiments.speed.timing import measure, peak_mib
 from experiments.speed.workers import WorkerError
 from experiments.speed.works import files, scene
@@ -45,6 +48,7 @@ from jaxdn.core.frame import Frame, frame_at, written_out
 from jaxdn.evaluation.compare import describe_machine
 from jaxdn.evaluation.report import save_png
 from jaxdn.render import scene_from_record, use_variant
+from jaxdn.runtime.atomic_files import write_json
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.zoo.weights import SHIPPED
 
@@ -57,6 +61,8 @@ class Settings:
     """The fastest weights of each method on one tiny clip, to see that everything works."""
     clips: tuple[Path, ...] = ()
     """Folders of your own clips, with noisy layers and a reference; default: two of the scene families."""
+    methods: tuple[str, ...] = ()
+    """Names of the rows to measure, as the page has them; default: all."""
     out: Path | None = None
     """Folder of the results; default: runs/chart, with --quick runs/chart-quick."""
 
@@ -64,10 +70,14 @@ class Settings:
 class Run:
     """One run: the measurements, their storage and the messages."""
 
-    def __init__(self, sizes: Sizes, clips: Sequence[EvaluationClip], folder: Path, console: Console) -> None:
+    def __init__(
+        self, sizes: Sizes, clips: Sequence[EvaluationClip], folder: Path, console: Console, methods: Sequence[str] = ()
+    ) -> None:
         self.sizes, self.clips, self.folder, self.console = sizes, clips, folder, console
         self.denoisers = chosen(quick=sizes.quick)
-        self.ways = ways(self.denoisers, quick=sizes.quick)
+        self.ways = select_ways(ways(self.denoisers, quick=sizes.quick), methods)
+        if methods:
+            self.denoisers = []  # no parts of frames then
         self.labels = {each.name: (each.family, each.variant, each.reads) for each in self.ways}
         self.labels[RENDERER] = (RENDERER, "plain", "")
         self.reads = sorted({each.reads for each in self.ways})
@@ -248,7 +258,7 @@ def main(settings: Settings) -> None:
     sizes = footage.QUICK if settings.quick else footage.FULL
     folder = settings.out or Path("runs") / ("chart-quick" if settings.quick else "chart")
     places = list(settings.clips) or footage.render(sizes, Path("data") / folder.name)
-    run = Run(sizes, [footage.read(place) for place in places], folder, console)
+    run = Run(sizes, [footage.read(place) for place in places], folder, console, settings.methods)
     missing = left_out() + ([] if run.meter else [NOT_MEASURABLE])
     run.store.put("left_out", "here", missing)
     for sentence in missing:
@@ -265,6 +275,8 @@ def main(settings: Settings) -> None:
     page = write_page(folder, run.store.data, found, equals, (run.timed_size, run.own_size))
     quality = summary.headline(found)
     front = summary.pareto(found, quality[0], run.timed_size, render=bool(run.store.data["render"]))
+    measured = Measured(len(run.clips), run.own_size, run.timed_size, max(run.layers), settings.methods)
+    write_json(folder / "speed-error-against-time.json", record_front(front, equals, quality, measured))
     print(summary.front_table(front, equals, run.timed_size, max(run.layers), quality))
     print(f"raw numbers: {run.store.path}\npage:        {page}  ({time.monotonic() - began:.0f} s in total)")
 

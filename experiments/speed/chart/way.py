@@ -85,5 +85,5 @@ def way(candidate: Model, variant: str = PLAIN, *, prepare: Prepare = as_it_is, 
     family = candidate.label
     name = family if variant == PLAIN else f"{family}, {variant}"
     sparse = candidate.method is not None and candidate.method.sparse
-    samples = (*FRACTIONS, *DENOISED_SPP) if sparse and variant == PLAIN else DENOISED_SPP
+    samples = (*FRACTIONS, *DENOISED_SPP) if sparse and variant != ALL else DENOISED_SPP
     return Way(name, family, variant, named(denoiser.reads), timed, images if scored else None, family, samples)

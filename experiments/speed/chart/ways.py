@@ -86,6 +86,14 @@ def ways(denoisers: Sequence[Model], *, quick: bool = False) -> list[Way]:
     return [*found, *of_ntd.untrained()]
 
 
+def select_ways(found: Sequence[Way], names: Sequence[str]) -> list[Way]:
+    """Those of these names; all for no names. Raises ValueError for an unknown one."""
+    known = {each.name: each for each in found}
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"--methods: expected some of {'; '.join(known)}, got {'; '.join(unknown)}.")
+    return [known[name] for name in names] or list(found)
+
+
 def left_out() -> list[str]:
     """Why some rows are missing here, in sentences."""
     sentences = [why for name, why in peers.missing().items() if name == "pyoidn"]
