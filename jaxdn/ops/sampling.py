@@ -131,8 +131,8 @@ def rotate_pattern(height: int, width: int, frame: jax.Array | int) -> jax.Array
     The binary digits of the ordered dither (Bayer 1973), each flipped where the frame's number has a 1, its lowest
     digit the first. With budgets of ``2^-n`` samples a pixel, ``round_stochastically`` gives every pixel one sample in
     each run of ``2^n`` frames that begins at a multiple of it. Of a half, the pixels are a checkerboard in every frame;
-    of a quarter, each aligned 2x2 block has one. Any other budget is that of every frame, up to what its borders cut
-    off: the dither has as many digits as the sides of 65,536 pixels.
+    of a quarter, each aligned 2x2 block has one. Every frame has nearly any other budget, too: the dither is of
+    65,536 x 65,536 pixels, and only the borders of the frame cut it off.
     """
     rows, columns = (jnp.arange(size, dtype=jnp.uint32) for size in (height, width))
     order = jnp.zeros((height, width), jnp.uint32)

@@ -137,8 +137,7 @@ def steady(options: Options) -> Denoiser:
     Reads albedo, normal, roughness, depth, previous_depth, motion, ids and sample_count, and reflectance with
     ``demodulate="brdf"``; without a buffer, what it would guide or test is left out. Pixels without a surface (depth at
     ``FAR`` or id -1) pass through; those without samples have the light of their history, or else of their neighbours.
-    Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its
-    contents.
+    Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
