@@ -12,6 +12,7 @@ when (``measured``: revision, date, machine) and by which command. ``kind`` says
 * ``bench``: the rows of ``make bench``, one line for each workload and implementation.
 * ``raw``: no table; another file names it as its ``raw`` data.
 
+A file with ``claims`` says what holds of a paper: claim, paper, here, verdict; the end of the page has those of all.
 A file with ``readme`` is in the README too: the part of it that ``columns``, ``rows`` and ``where`` choose.
 """
 
@@ -48,6 +49,11 @@ PSNR is in dB and higher is better. Lower is better for FLIP, L1 and relative MS
 the previous frame did not see. The revision is that of the commit that recorded the numbers, and has the command that
 did it; later ones may lack it. The best value of a
 column, of each group of its rows, or of a row that compares methods, is bold.
+"""
+CLAIMS = """## What the papers claim
+
+The claims of all tables above. Each table says with which clips and how many updates it was made; the papers have whole
+scenes, and thousands of updates. *Holds*: at least half as far in the paper's direction as there.
 """
 
 Result = Mapping[str, Any]
@@ -87,7 +93,18 @@ def results_page(results: Sequence[Result]) -> str:
         if picture := result.get("picture"):
             parts.append(f"![{picture['alt']}]({picture['file']})\n\n*{picture['caption']}*\n")
         parts.append(_provenance(result))
+    parts += _claims(results)
     return "\n".join(part for part in parts if part)
+
+
+def _claims(results: Sequence[Result]) -> list[str]:
+    """The claims of papers of all measurements that have some, in one table."""
+    lines = [
+        [result["title"], claim["claim"], claim["paper"], claim["here"], claim["verdict"]]
+        for result in results
+        for claim in result.get("claims", ())
+    ]
+    return [CLAIMS, _markdown(["table", "claim", "paper", "here", ""], lines)] if lines else []
 
 
 def readme_block(results: Sequence[Result]) -> str:

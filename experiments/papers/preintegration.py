@@ -4,25 +4,29 @@
 
 Every filter of the table of methods that demodulates is run with each choice on clips that have the buffer
 ``reflectance`` (``experiments.papers.rooms`` renders some), and next to it the given weights, those that are shipped,
-and Open Image Denoise frame by frame where it is installed. Writes ``runs/preintegration/report.html``, and every
-method's image of every clip as ``pictures/CLIP/METHOD.png``, to be looked at at 100 %.
+and Open Image Denoise frame by frame where it is installed. Writes ``runs/preintegration/report.html``, every method's
+image of every clip as ``pictures/CLIP/METHOD.png``, to be looked at at 100 %, and ``demodulation.json`` in the format
+of docs/results.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import tyro
 
+from experiments.measurement import describe_measurement
 from jaxdn.clips import find_clips
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import Results, text_table, write_report
 from jaxdn.evaluation.report.images import save_png
+from jaxdn.evaluation.report.results import mean_scores
 from jaxdn.methods.demodulation import Demodulation
 from jaxdn.methods.registry import method_named
+from jaxdn.runtime.atomic_files import write_json
 from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
@@ -73,8 +77,30 @@ def main(settings: Settings) -> None:
     results = compare(list(contestants(settings.weights)), folders, title=title, settings={"clips": len(folders)})
     page = write_report(results, settings.out)
     save_pictures(results, settings.out / "pictures")
+    write_json(settings.out / "demodulation.json", record(results, settings))
     print(text_table(results))
     print(f"report: {page}")
+
+
+def record(found: Results, settings: Settings) -> dict[str, Any]:
+    """A row a filter, a column a way to demodulate, as a measurement for the page of results."""
+    means, ways = mean_scores(found), get_args(Demodulation)
+    rows = []
+    for name in filter_names():
+        if f"{name}, {ways[0]}" in means:
+            scores = [means[f"{name}, {by}"] for by in ways]
+            texts = [f"{one.unbiased_psnr:.2f} / {one.unbiased_temporal_psnr:.2f} / {one.flip:.3f}" for one in scores]
+            rows.append([f"`{name}`", *texts])
+    about = describe_measurement(
+        "table",
+        "Demodulation factors",
+        "Demodulation",
+        100,
+        command=" ".join(["python -m experiments.papers.preintegration", *(place.name for place in settings.clips)]),
+        what=f"{len(found.clips)} clips, 1 sample. PSNR / temporal PSNR / FLIP by the factor that light is divided by.",
+        rows=rows,
+    )
+    return about | {"columns": [{"name": "method"}, *({"name": f"`{by}`"} for by in ways)]}
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""The classical family side by side: each filter has a row with its errors and its time."""
+"""The classical family side by side: each filter has a row with its errors and its time, and with each demodulation."""
 
+import json
 import re
 
 import pytest
 
-from experiments.papers import classical
+from experiments.papers import classical, preintegration
+from experiments.results_page import read_results, results_page
 from jaxdn.zoo.ready import NOISY
 
 WEIGHTS, FILTER = "ntd-small", "taa"
@@ -46,3 +48,19 @@ def test_filters_are_scored_and_timed(tmp_path, capsys, monkeypatch):
             timed = f"{name} is left out" not in said
             assert re.fullmatch(r"\d+ \((\d+\.\d\d|nan)\) \|" if timed else r" ?\|", row[-1])
     assert {row[-1].strip() for row in rows if row[0] == f"| {NOISY}"} == {"|"}
+    # The page of results takes what is written for it: PSNR and FLIP of both lights, as in the table.
+    page = results_page(read_results(tmp_path / "out"))
+    (shown,) = (line for line in page.splitlines() if line.startswith(f"| `{FILTER}` | ") and line.count("|") == 10)
+    psnr = [row[1] for row in rows if row[0] == f"| {FILTER}"]
+    cells = [cell.strip(" *") for cell in shown.split("|")]
+    assert [cells[2], cells[6]] == psnr
+    # Clips of all reflected light are those on which ways to demodulate are compared.
+    monkeypatch.setattr(preintegration, "shipped_names", list)
+    monkeypatch.setattr(preintegration, "filter_names", lambda: [FILTER, "svgf"])
+    preintegration.main(preintegration.Settings([tmp_path / "data" / "reflected"], out=tmp_path / "demodulation"))
+    recorded = json.loads((tmp_path / "demodulation" / "demodulation.json").read_text())
+    assert [column["name"] for column in recorded["columns"]] == ["method", "`brdf`", "`albedo`", "`none`"]
+    ((name, *scores),) = recorded["rows"]
+    assert name == "`svgf`"
+    assert len(set(scores)) == 3
+    assert "### Demodulation factors" in results_page([recorded | {"file": "demodulation.json"}])

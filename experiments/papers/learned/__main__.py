@@ -2,8 +2,8 @@
 
     python -m experiments.papers.learned [--rooms rooms/*/scene.xml] [--scenes scenes]      # resumable
 
-Renders clips with layers of 1 to 32 samples, trains every network that a table needs, in its small size with the same
-number of updates and four samples a pixel (one for table 2 of Zeng et al.), and scores them on clips of seeds and
+Renders clips with layers of 1 to 32 samples, trains every network that a table needs with the same number of updates,
+in its small size but for table 3 of Hasselgren et al., and scores them on clips of seeds and
 scenes that none has seen. Writes ``runs/papers/report.md`` with every table and claim, ``report.html``, every method's
 image, maps of samples, and in ``measurements`` each table in the format of docs/results.
 """

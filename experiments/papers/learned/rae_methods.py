@@ -1,12 +1,13 @@
 """SVGF, A-SVGF, RAE and A-RAE (Chaitanya et al. 2017; Schied et al. 2017, 2018), each with and without adaptive
-accumulation.
+accumulation. Both autoencoders are trained by the loss of Chaitanya et al.
 """
 
 from experiments.papers.learned.scores import Claim, Table, ordinary, over_frames, psnr_gain
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 
-ROWS = ("svgf", "asvgf", "rae", "arae")
+RAE, ARAE = "rae of its paper", "arae of its paper"
+ROWS = ("svgf", "asvgf", RAE, ARAE)
 
 
 def text(found: Results) -> str:
@@ -17,7 +18,7 @@ def text(found: Results) -> str:
 def claims(found: Results) -> list[Claim]:
     """On adaptive accumulation. No number of the papers is known to us."""
     means, found_claims = mean_scores(found), []
-    for first, second in (("arae", "rae"), ("asvgf", "svgf")):
+    for first, second in ((ARAE, RAE), ("asvgf", "svgf")):
         better = psnr_gain(found, first, second)
         steadier = means[first].unbiased_temporal_psnr - means[second].unbiased_temporal_psnr
         ours = f"{better:+.2f} dB, temporal {steadier:+.2f} dB"

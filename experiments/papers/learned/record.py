@@ -7,8 +7,8 @@ from typing import Any
 from experiments.cycles.reference import decibels
 from experiments.measurement import describe_measurement
 from experiments.papers.learned.curves import METRICS, PICTURE, choose_frames, find_mean
-from experiments.papers.learned.scores import Claim, Table, rows_of
-from experiments.papers.learned.stages import FAMILIES, STAGES, Settings
+from experiments.papers.learned.scores import Table, rows_of
+from experiments.papers.learned.stages import FAMILIES, REFERENCE_SPP, STAGES, Settings
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import Scores, mean_scores
 
@@ -17,6 +17,7 @@ COLUMNS: Mapping[str, tuple[Callable[[Scores], float], int, str]] = {
     "temporal PSNR": (lambda one: one.unbiased_temporal_psnr, 2, "higher"),
     "disoccluded PSNR": (lambda one: decibels(one.unbiased_disoccluded_mse), 2, "higher"),
     "SSIM": (lambda one: one.ssim, 4, "higher"),
+    "L1": (lambda one: one.l1, 4, "lower"),
     "MSE": (lambda one: one.unbiased_mse, 5, "lower"),
     "FLIP": (lambda one: one.flip, 3, "lower"),
     "relative MSE": (lambda one: one.unbiased_relative_mse, 4, "lower"),
@@ -28,7 +29,7 @@ _Made = tuple[list[dict[str, Any]], list[list[Any]], str]
 
 
 def record_table(one: Table, found: Results, settings: Settings) -> dict[str, Any]:
-    """A table as a measurement, with what holds of the paper's claims as notes."""
+    """A table as a measurement, with what holds of the paper's claims."""
     columns, rows, what = _scores_of(one, found) if one.figures is None else _figures_of(one.figures(found))
     what = f"{what} {_describe(settings)}"
     if any(STAGES[row].start for row in one.rows if row in STAGES):
@@ -40,7 +41,10 @@ def record_table(one: Table, found: Results, settings: Settings) -> dict[str, An
     return {
         **described,
         "columns": columns,
-        "notes": [_tell(claim) for claim in one.claims(found)],
+        "claims": [
+            {"claim": claim.text, "paper": claim.paper, "here": claim.ours, "verdict": claim.verdict}
+            for claim in one.claims(found)
+        ],
     }
 
 
@@ -51,9 +55,7 @@ def _scores_of(one: Table, found: Results) -> _Made:
         for label, scores in mean_scores(rows_of(found, one.rows)).items()
     ]
     columns = [{"name": title, "decimals": decimals, "best": best} for title, (_, decimals, best) in COLUMNS.items()]
-    what = (
-        f"Means over {len(found.clips)} test clips of other seeds, but for SSIM and FLIP without the references' noise."
-    )
+    what = f"Means over {len(found.clips)} test clips of other seeds; SSIM, L1 and FLIP have the references' noise."
     return [{"name": "method"}, *columns], rows, what
 
 
@@ -98,10 +100,14 @@ def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: 
 
 
 def _describe(settings: Settings) -> str:
-    how = ", by the presets and recipes of their papers" if settings.as_published else ""
+    """The clips and the training, and with ``--as-published`` what of it is not the papers'."""
+    size, rooms = f"{settings.size} x {settings.size}", " and rooms" if settings.rooms else ""
+    how = "By the presets and recipes of their papers, but for" if settings.as_published else "Trained by"
     return (
-        f"Clips of {settings.size} x {settings.size} pixels; {settings.clips} training clips of 8 frames of each of "
-        f"{len(FAMILIES) + len(settings.rooms)} families and rooms, {settings.steps} updates of small networks{how}."
+        f"{how} {settings.steps} updates of the networks (small ones where they are not called large) on windows of "
+        f"{settings.frames} frames, on {settings.clips} clips of 8 frames of {size} pixels of each of "
+        f"{len(FAMILIES) + len(settings.rooms)} families{rooms}, with references of {REFERENCE_SPP} samples. Each "
+        "network was trained once: a tenth of a decibel is chance."
     )
 
 
@@ -116,12 +122,6 @@ def _command(settings: Settings) -> str:
     for name, places in (("rooms", settings.rooms), ("scenes", settings.scenes)):
         words += [f"--{name}", *(place.name for place in places)] if places else []
     return " ".join(words)
-
-
-def _tell(claim: Claim) -> str:
-    return (
-        f"{claim.text}: {claim.paper} in the paper, {claim.ours} here; {'holds' if claim.holds else 'does not hold'}."
-    )
 
 
 def _round(value: float, decimals: int) -> float | None:

@@ -18,6 +18,9 @@ from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 from jaxdn.zoo.ready import find_model
 
+NOT_STATED = "not stated"
+"""What a paper says where it has no such figure."""
+
 
 class Claim(NamedTuple):
     """What a paper says, beside what was measured here."""
@@ -25,7 +28,13 @@ class Claim(NamedTuple):
     text: str
     paper: str
     ours: str
-    holds: bool
+    holds: bool | None = None
+    """None where the paper states nothing."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether it holds, in words; nothing where the paper states nothing."""
+        return "" if self.holds is None else "holds" if self.holds else "not here"
 
 
 class Table(NamedTuple):
@@ -121,5 +130,5 @@ def psnr_gain(found: Results, first: str, second: str) -> float:
 def claims_table(claims: Iterable[Claim]) -> str:
     """As Markdown."""
     lines = ["| the paper's claim | there | here | |", "|---|---|---|---|"]
-    lines += [f"| {one.text} | {one.paper} | {one.ours} | {'holds' if one.holds else 'not here'} |" for one in claims]
+    lines += [f"| {one.text} | {one.paper} | {one.ours} | {one.verdict} |" for one in claims]
     return "\n".join(lines)

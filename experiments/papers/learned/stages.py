@@ -20,6 +20,8 @@ FAMILIES = ("parlour", "fruit", "mobile", "pinkroom", "robot")
 HELD_OUT = ("parlour", "mobile", "pinkroom", "robot")
 """The families that :data:`STAGES` leave out of training, one each."""
 LAYERS = (1, 2, 4, 8, 16, 32)
+REFERENCE_SPP = 64
+"""Samples a pixel of the references that networks are trained on."""
 BUDGET = 4
 """Samples a pixel: the same everywhere, or in the mean for those who ask for samples. One table has another number."""
 TRAINED = "ntd,rae,arae,ntasd,dasr,svgf,steady"
@@ -40,6 +42,8 @@ class Stage(NamedTuple):
     """The family whose clips alone are trained on."""
     recipe: str | None = None
     """Of the method; None: the usual one."""
+    preset: str = "paper"
+    """Of the method, with ``--as-published``."""
     spp: int = BUDGET
     """Samples a pixel of what it is trained on, if it asks for none."""
     start: str | None = None
@@ -121,14 +125,15 @@ STAGES = {
     ),
     "dasr": Stage("dasr", {"size": "small"}, recipe="hasselgren"),
     "dasr, uniform": Stage("dasr", _EVEN, recipe="hasselgren"),
-    "rae": Stage("rae", {"size": "small"}, recipe="hasselgren"),
-    "arae": Stage("arae", {"size": "small"}, recipe="hasselgren"),
+    "rae": Stage("rae", {"size": "small"}, recipe="hasselgren", preset="hasselgren"),
+    "rae of its paper": Stage("rae", {"size": "small"}, recipe="paper"),
+    "arae of its paper": Stage("arae", {"size": "small"}, recipe="paper"),
     **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
     **{f"ntasd, uniform, only {family}": _UNIFORM._replace(only=family) for family in HELD_OUT},
     **dict(_budget_stages()),
     **dict(_changed_stages()),
 }
-"""Each by the loss of its paper; those that Hasselgren et al. compare all by theirs."""
+"""Each by the loss of its paper; those that Hasselgren et al. compare all by theirs, and ``rae`` as they have it."""
 
 
 @dataclass
@@ -174,7 +179,7 @@ class Settings:
 
 def render_all(settings: Settings) -> list[Path]:
     """Render what is missing: clips to train on, of seeds from 0 on, and to test on, which are returned."""
-    own = RenderSettings(settings.size, settings.size, layers=LAYERS, draws=BUDGET, reference_spp=64)
+    own = RenderSettings(settings.size, settings.size, layers=LAYERS, draws=BUDGET, reference_spp=REFERENCE_SPP)
     seeds, place = list(range(settings.clips)), settings.data / "train"
     for scene, randomised in [*((str(room), True) for room in settings.rooms), *((name, False) for name in FAMILIES)]:
         source = ClipSource(scene, seeds, 8, randomised=randomised, denoiser=TRAINED)
@@ -190,12 +195,12 @@ def render_all(settings: Settings) -> list[Path]:
 
 
 def publish(stage: Stage) -> Stage:
-    """A stage by the preset of its paper, which the stage's own options replace, and, of ``ntd``, by its recipe.
+    """A stage by its preset, whose values the stage's own options replace, and, of ``ntd``, by the recipe of its paper.
 
     The recipes of the other stages are those of papers anyway.
     """
     recipe = (stage.recipe or "").replace("paper-loss", "paper") or None
-    return stage._replace(options={"preset": "paper", **stage.options}, recipe=recipe)
+    return stage._replace(options={"preset": stage.preset, **stage.options}, recipe=recipe)
 
 
 AFTERWARDS = ", then taa"
@@ -223,9 +228,11 @@ def _weights_of(name: str, settings: Settings) -> Path:
     """The file of a stage's weights, trained if they are not, and before them those that it starts from."""
     stage = publish(STAGES[name]) if settings.as_published else STAGES[name]
     method = method_named(stage.method)
-    recipe = method.recipe_named(stage.recipe)._replace(
+    recipe = method.recipe_named(stage.recipe)
+    recipe = recipe._replace(
         steps=settings.steps,
         frames=settings.frames,
+        crop=min(recipe.crop, settings.size),
         spp=(1,) if method.has_option("budget") else (stage.spp,),
     )
     if not settings.as_published:
