@@ -1,8 +1,8 @@
 """Neural temporal denoising for indirect illumination (``ntd``).
 
 A U-Net predicts, for every pixel, 5x5 softmax kernels for the noisy image at three scales, one 5x5 kernel for the
-previous output warped by *dual* motion vectors, and how to blend them. Details that the paper leaves open are options;
-``preset="paper"`` takes the paper's where it states them; the documentation lists what it leaves open.
+previous output warped by *dual* motion vectors, and how to blend them. Its details are options: ``preset="paper"`` has
+what the paper states, and the least surprising choice where it states nothing; the documentation lists both.
 
 Beyond the paper, the kernels are guided: what the buffers show of two surfaces is compared before the network's logits,
 so that it need not learn where edges are (:func:`jaxdn.ops.kernel_prediction.softmax.softmax_filter`).
@@ -44,7 +44,7 @@ PRECISIONS = {"albedo": (3, 3.0), "normal": (3, 3.0), "depth": (1, 6.0), "reflec
 
 @dataclass(frozen=True)
 class Options:
-    """Details that the paper leaves open; the first choice is the default."""
+    """Where other settings than the paper's may be better, or it states none."""
 
     size: Literal["large", "small"] | Widths = "large"
     """The U-Net's widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""

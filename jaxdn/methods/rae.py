@@ -40,7 +40,7 @@ Hidden = tuple[jax.Array, ...]
 
 @dataclass(frozen=True)
 class Options:
-    """Details that the papers leave open; the first choice is the default."""
+    """Where the papers have different settings, other ones may be better, or none is stated."""
 
     size: Literal["large", "small"] | Widths = "large"
     """The network's widths, by name or as tuples (see :func:`jaxdn.networks.graph.recurrent_unet`)."""

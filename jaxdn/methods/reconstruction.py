@@ -1,11 +1,11 @@
 """From a network's heads to an image: kernels at three scales and for the history, or less, down to the image itself.
 
-The steps of Hasselgren et al. 2020, sec. 3.2, each of which can be left out:
+The ladder of Hasselgren et al. 2020, fig. 7, and a rung of ours between its first two:
 
 * ``"temporal"``: 5x5 softmax kernels for the noisy image at full, half and quarter resolution, blended from coarse to
   fine, and one for the warped history, blended with the weight ``1 - alpha^t``;
 * ``"three-scales"``: the same without the history's kernel (the network still sees the history);
-* ``"one-scale"``: one kernel a pixel, for the noisy image at full resolution;
+* ``"one-scale"``, in no paper: one kernel a pixel, for the noisy image at full resolution;
 * ``"direct"``: three numbers a pixel, the compressed image.
 """
 

@@ -9,9 +9,12 @@ import re
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 from docs import hooks
+from jaxdn.core.frame import Frame
 from jaxdn.methods.registry import methods
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.recipe import Recipe
@@ -23,11 +26,19 @@ FACTS = [
 ]
 
 
-def options_of(paper: dict[str, Any], preset: str | None) -> dict[str, Any]:
-    """The options of the paper's method, of a preset or the defaults."""
+def options_of(paper: dict[str, Any], preset: str | None, method: str | None = None) -> dict[str, Any]:
+    """The options of the paper's method, or of another one, of a preset or the defaults."""
     given = {} if preset is None else {"preset": preset}
-    options = methods()[paper["method"]].parse_options(given)
+    options = methods()[method or paper["method"]].parse_options(given)
     return {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+
+
+def count_weights(paper: dict[str, Any], preset: str | None, size: str) -> list[int]:
+    """How many weights each network of the paper's method has, from the smallest on."""
+    denoiser = methods()[paper["method"]].factory(preset=preset, size=size)
+    params = jax.eval_shape(lambda: denoiser.init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3)))))
+    parts = params.values() if denoiser.samples is not None else [params]
+    return sorted(sum(leaf.size for leaf in jax.tree.leaves(part)) for part in parts)
 
 
 def recipe_of(recipe: Recipe) -> dict[str, Any]:
@@ -82,9 +93,13 @@ def test_a_fact_is_that_of_the_code(paper, fact):
     assert fact["status"] in hooks.STATUSES
     preset = fact.get("preset", paper.get("preset"))
     for name, value in fact.get("options", {}).items():
-        assert options_of(paper, preset)[name] == value, name
+        assert options_of(paper, preset, fact.get("method"))[name] == value, name
         if fact["status"] == "as published":
             assert options_of(paper, None)[name] == value, f"{name}: published, but not the default"
+    for size, numbers in fact.get("weights", {}).items():
+        assert count_weights(paper, preset, size) == numbers, size
+        for number in numbers:
+            assert f"{number:,}" in fact["here"]
     recipe = fact.get("of_recipe", paper.get("recipe"))
     for name, value in fact.get("recipe", {}).items():
         assert recipe_of(methods()[paper["method"]].recipe_named(recipe))[name] == value, name
@@ -105,7 +120,7 @@ def test_a_fact_says_where_it_stands_and_what_holds_it(paper, fact):
     if fact["status"] in ("ours", "not stated"):
         assert fact["here"], "no reason is given"
     if fact["status"] == "preset":
-        usual = options_of(paper, None)
+        usual = options_of(paper, None, fact.get("method"))
         other = [value != usual[name] for name, value in fact.get("options", {}).items()]
         if "recipe" in fact:
             recipe = recipe_of(methods()[paper["method"]].recipe_named(None))

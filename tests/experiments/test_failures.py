@@ -11,6 +11,7 @@ from experiments.papers.failures.clips import digest_scene
 from experiments.papers.failures.scenes import MOVING, SCENES
 from experiments.papers.failures.sheet import make_sheet, make_table
 from jaxdn.core.frame import Frame
+from jaxdn.methods.registry import methods
 
 
 def test_affected_is_what_was_hidden_or_shows_other_light_than_its_surface_did():
@@ -108,6 +109,18 @@ def test_a_sheet_has_every_image_enlarged_under_its_name(rng):
         make_table({"a": [images["method 0"]] * 2, "b": []}, ["one", "two"])
     with pytest.raises(ValueError, match="expected one size"):
         make_sheet({"a": images["method 0"], "b": images["method 1"][:3]})
+
+
+def test_a_method_that_never_responds_says_so():
+    found = {"taa": {"shadow": measure.Failure(20.0, None), "blur": measure.Failure(20.0, 0)}}
+    counts = {name: {"affected": 5} for name in ("shadow", "blur")}
+    described = failures.describe(failures.Settings(), found, counts)
+    assert described["failures-response"]["rows"] == [["taa", "never", 0]]
+
+
+def test_every_preset_of_a_paper_that_is_a_filter_has_a_row():
+    presets = {name for name, method in methods().items() if method.filter and "paper" in method.presets}
+    assert presets == set(failures.PAPERS)
 
 
 @pytest.mark.slow

@@ -1,14 +1,23 @@
-"""A white furnace through every filter: under even light of 1 an image is the reflectance, whatever moves."""
+"""A white furnace: under even light of 1 an image is the reflectance, whatever moves.
+
+Through every filter, also of dark surfaces; through shipped weights of surfaces that reflect more than the floor of the
+divisor, as their histories do not have what a division left.
+"""
 
 import functools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxdn import denoisers
-from jaxdn.core.frame import Frame
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.denoiser.rollout import denoise
 from jaxdn.methods.registry import methods
+from jaxdn.zoo.ready import find_model
 from tests.methods.lobe_scenes import run
+from tests.needs import require
 
 HEIGHT, WIDTH, FRAMES = 12, 32, 16
 SPEED = 0.37
@@ -72,7 +81,39 @@ def test_a_reflectance_that_changes_darkens_nothing(name, change, glossy):
 @pytest.mark.parametrize("name", [name for name in FILTERS if name != "taa"])
 def test_a_dark_texture_that_moves_is_not_blurred(name, glossy):
     """Not of ``taa``, which has the whole radiance in its history."""
-    pixel = np.arange(WIDTH) + (np.arange(16)[:, None] + 0.5) / 16
-    stripes = [np.where((pixel - SPEED * index + 100) % 8 < 4, 0.04, 0.12).mean(0) for index in range(FRAMES)]
-    frames = furnace([np.broadcast_to(line, (HEIGHT, WIDTH)) for line in stripes], glossy=glossy, speed=SPEED)
+    frames = furnace(stripes(0.04, 0.12), glossy=glossy, speed=SPEED)
     np.testing.assert_allclose(whiteness(name, frames)[:, :, 12:-4], 1.0, atol=0.02)
+
+
+def stripes(dark, light, *, height=HEIGHT, width=WIDTH):
+    """The reflectance [T, H, W] of stripes that move."""
+    pixel = np.arange(width) + (np.arange(16)[:, None] + 0.5) / 16
+    lines = [np.where((pixel - SPEED * index + 100) % 8 < 4, dark, light).mean(0) for index in range(FRAMES)]
+    return np.stack([np.broadcast_to(line, (height, width)) for line in lines])
+
+
+def whiteness_of_weights(name, frames):
+    """What each image of shipped weights is in parts of the reflectance, without the sides, where things come in."""
+    model = find_model(name)
+    clip = jax.tree.map(lambda *each: jnp.stack(each), *frames)
+    images = jax.jit(lambda params, clip: denoise(model.denoiser, params, Clip(clip)))(model.params, clip)
+    return np.asarray(images / clip.reflectance)[:, :, 12:-4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["steady-balanced", "steady-fast", "ntd-small"])
+def test_weights_keep_a_grey_texture_that_moves(name):
+    """Above the floor of the divisor, nothing is left of the texture."""
+    frames = furnace(stripes(0.3, 0.6, height=32, width=64), glossy=False, speed=SPEED)
+    np.testing.assert_allclose(whiteness_of_weights(name, frames), 1.0, atol=0.02)
+
+
+@pytest.mark.slow
+def test_the_combiner_is_as_bright_as_the_light_on_the_whole():
+    """Pixel by pixel it is as the library's network makes it, which keeps no furnace."""
+    require("pyoidn")
+    frames = [
+        frame._replace(albedo=frame.reflectance)
+        for frame in furnace(stripes(0.04, 0.12, height=32, width=64), glossy=False, speed=SPEED)
+    ]
+    np.testing.assert_allclose(whiteness_of_weights("combiner-high", frames).mean((1, 2)), 1.0, atol=0.01)

@@ -38,7 +38,7 @@ from jaxdn.evaluation.report.images import save_png
 from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model, ready_names
 
-PAPERS = ("svgf", "asvgf", "trmv", "relax", "reblur")
+PAPERS = ("svgf", "asvgf", "trmv", "relax", "reblur", "taa")
 """Filters with a preset of the paper."""
 WITH_VECTORS = ("ntd-small", "ntd-large")
 """Shipped weights that are measured with vectors of effects too, for which they were not trained."""
@@ -207,12 +207,16 @@ def describe(
         )
     response = (
         "Frames at rest until less than a tenth of the image before is left, in the pixels that changed last, over "
-        "what the same method shows that begins there; 0: the first frame; nothing: none of the "
-        f"{settings.frames - MOVING} frames."
+        "what the same method shows that begins there; 0: the first frame; never: not within "
+        f"{settings.frames - MOVING} frames. Methods "
+        "without shipped weights (`ntasd`, `dasr`, `rae`, `arae`) are left out."
     )
     title = "Failures that the papers name"
     errors = [[label, *(one.psnr for one in clips.values())] for label, clips in found.items()]
-    responses = [[label, *(one.response for one in clips.values())] for label, clips in found.items()]
+    responses = [
+        [label, *("never" if one.response is None else one.response for one in clips.values())]
+        for label, clips in found.items()
+    ]
     about = describe_measurement(
         "table", f"{title}: error", "Quality", 63, command=COMMAND, what=clips + error, rows=errors
     )

@@ -95,7 +95,7 @@ def _draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:
         for row, curves in found.items():
             axis.plot(range(2, len(curves[name]) + 1), curves[name][1:], label=row, linewidth=1)
         axis.set_ylabel(name.upper())
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(found))
     axes[-1].set_xlabel("frame")
     figure.savefig(path)
     plt.close(figure)
