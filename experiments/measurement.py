@@ -3,6 +3,7 @@
 :mod:`experiments.results_page` shows such files. Those of ``runs`` are copied to docs/results by hand.
 """
 
+import math
 import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -35,6 +36,11 @@ def describe_measurement(
     }
     about = {"kind": kind, "title": title, "section": section, "order": order, "measured": measured}
     return {**about, "command": command, "what": what, "rows": list(rows)}
+
+
+def round_finite(value: float, decimals: int) -> float | None:
+    """The number with so many decimals; None for NaN and infinities, which JSON does not have."""
+    return round(float(value), decimals) if math.isfinite(value) else None
 
 
 def find_revision() -> str | None:

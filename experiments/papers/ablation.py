@@ -2,9 +2,10 @@
 
 A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss; all three share
 the network, the data, the seed and the number of steps. The demonstration goes on from shipped weights with the loss
-that these were trained with, as a few minutes from nothing lose to every filter; so A and B begin with weights that
-have learned from dual vectors and hidden pixels, and the rows say little of what these are worth. The specialist begins
-with new ones and has the paper's loss, whose occlusion term comes in the second half of training.
+that these were trained with, as a few minutes from nothing lose to every filter; so all three begin with weights
+that have learned from dual vectors and hidden pixels, and the rows say little of what dual vectors and the occlusion
+loss are worth. The specialist begins with new ones and has the paper's loss, whose occlusion term comes in the second
+half of training.
 
     python -m experiments.papers.ablation  # `make train`: a demonstration, a quarter of an hour on two cores
     python -m experiments.papers.ablation --preset specialist  # trained and tested on different clips of one scene
@@ -127,8 +128,8 @@ class Settings:
 
     preset: Literal["demo", "specialist"] = "demo"
     """demo: SMALL networks that go on from shipped weights on eight small clips. specialist: trained and
-    tested on different clips of one scene, as one row of Hasselgren et al. 2020, table 2; the loss and the optimiser's
-    kind are those of Zeng et al."""
+    tested on different clips of one scene, as in one row of Hasselgren et al. 2020, table 2; the loss and the
+    optimiser's kind are those of Zeng et al."""
     name: str | None = None
     """Folder under runs/ for weights, logs and the report; default: the preset's name."""
     only: Literal["all", "render", "train", "report"] = "all"

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from experiments.cycles.reference import decibels
-from experiments.measurement import describe_measurement
+from experiments.measurement import describe_measurement, round_finite
 from experiments.papers import results, rooms
 from experiments.papers.preintegration import save_pictures
 from experiments.speed.timing import Call
@@ -45,7 +45,6 @@ from jaxdn.zoo.weights import shipped_names
 FAMILIES = ("fruit", "robot", "mobile", "pinkroom", "parlour")
 SEED = 2000
 LIGHTS: tuple[NoisyLight, ...] = ("indirect", "reflected")
-COMMAND = "make compare"
 AGAINST = "svgf"
 """The filter that the times of all others are compared with."""
 _WARM = 6
@@ -149,12 +148,12 @@ def main(settings: Settings) -> None:
         save_pictures(found, settings.out / light / "pictures")
         lines += ["", title, "", results.table(found, {"milliseconds": shown})]
         print(f"report: {page}", flush=True)
-    write_json(settings.out / "quality-filters.json", record_errors(errors, settings))
-    if times:
-        write_json(settings.out / "speed-filters.json", record_times(times, settings))
     table = settings.out / "table.md"
     table.write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
+    write_json(settings.out / "quality-filters.json", record_errors(errors, settings))
+    if AGAINST in times:
+        write_json(settings.out / "speed-filters.json", record_times(times, settings))
 
 
 def record_errors(errors: Mapping[str, Results], settings: Settings) -> dict[str, Any]:
@@ -178,18 +177,18 @@ def record_errors(errors: Mapping[str, Results], settings: Settings) -> dict[str
         "all light, not for indirect light alone."
     )
     about = describe_measurement(
-        "table", "All filters side by side", "Quality", 60, command=COMMAND, what=what, rows=rows
+        "table", "All filters side by side", "Quality", 60, command=_command(settings), what=what, rows=rows
     )
     return about | {"columns": columns}
 
 
-def _errors_of(scores: Scores) -> list[float]:
+def _errors_of(scores: Scores) -> list[float | None]:
     hidden = decibels(scores.unbiased_disoccluded_mse)
     return [
-        round(scores.unbiased_psnr, 2),
-        round(scores.unbiased_temporal_psnr, 2),
-        round(hidden, 2),
-        round(scores.flip, 3),
+        round_finite(scores.unbiased_psnr, 2),
+        round_finite(scores.unbiased_temporal_psnr, 2),
+        round_finite(hidden, 2),
+        round_finite(scores.flip, 3),
     ]
 
 
@@ -200,6 +199,17 @@ def _describe_clips(settings: Settings, found: Results) -> str:
     return f"{own} and {more} of rooms (320 x 180, 8 frames)" if more else own
 
 
+def _command(settings: Settings) -> str:
+    """What measures it again, in a folder of its own."""
+    words, usual = [place.name for place in settings.scenes], Settings()
+    for name in ("size", "frames", "reference_spp"):
+        if getattr(settings, name) != getattr(usual, name):
+            words += [f"--{name.replace('_', '-')}", str(getattr(settings, name))]
+    if settings.families != usual.families:
+        words += ["--families", *settings.families]
+    return f'make compare SETTINGS="{" ".join(words)}"' if words else "make compare"
+
+
 def record_times(times: Mapping[str, float], settings: Settings) -> dict[str, Any]:
     """The times relative to :data:`AGAINST` as a measurement for the page of results."""
     height, width = settings.timed
@@ -208,7 +218,9 @@ def record_times(times: Mapping[str, float], settings: Settings) -> dict[str, An
         "middle of a clip, each method in a process of its own, interleaved."
     )
     rows = [[f"`{name}`", round(ms / times[AGAINST], 2)] for name, ms in times.items() if math.isfinite(ms)]
-    about = describe_measurement("table", "Time of the filters", "Speed", 330, command=COMMAND, what=what, rows=rows)
+    about = describe_measurement(
+        "table", "Time of the filters", "Speed", 330, command=_command(settings), what=what, rows=rows
+    )
     return about | {"columns": [{"name": "method"}, {"name": f"time relative to `{AGAINST}`", "decimals": 2}]}
 
 

@@ -32,7 +32,7 @@ from jaxdn.recipes.recipe import Recipe
 
 @dataclass(frozen=True)
 class Options(Sampling):
-    """Where the papers have different settings, other ones may be better, or none is stated."""
+    """What the papers set differently or leave open, or where another setting may be better."""
 
     size: Literal["large", "small"] | Widths = "large"
     """The U-Nets' widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""

@@ -44,7 +44,7 @@ PRECISIONS = {"albedo": (3, 3.0), "normal": (3, 3.0), "depth": (1, 6.0), "reflec
 
 @dataclass(frozen=True)
 class Options:
-    """Where other settings than the paper's may be better, or it states none."""
+    """What the papers set differently or leave open, or where another setting may be better."""
 
     size: Literal["large", "small"] | Widths = "large"
     """The U-Net's widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""

@@ -40,7 +40,7 @@ Hidden = tuple[jax.Array, ...]
 
 @dataclass(frozen=True)
 class Options:
-    """Where the papers have different settings, other ones may be better, or none is stated."""
+    """What the papers set differently or leave open, or where another setting may be better."""
 
     size: Literal["large", "small"] | Widths = "large"
     """The network's widths, by name or as tuples (see :func:`jaxdn.networks.graph.recurrent_unet`)."""

@@ -55,7 +55,8 @@ def unbiased_illumination(*, hidden: float = 1.0, squared_from: float = 0.6) -> 
     weights are far from good; then they are squares that the noise of the target does not bias
     (:func:`jaxdn.losses.unbiased`), so that images end as bright as they should be. The occlusion term has the weight
     ``hidden`` from the first update on. Its mask has all pixels that the previous frame did not see
-    (``Frame.visible``); a mask of the pixels whose dual vectors differ has less than half of these.
+    (``Frame.visible``); a mask of the pixels whose dual vectors differ from the traditional ones has less than half of
+    these.
     """
 
     def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:

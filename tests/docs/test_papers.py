@@ -95,7 +95,7 @@ def test_a_fact_is_that_of_the_code(paper, fact):
     for name, value in fact.get("options", {}).items():
         assert options_of(paper, preset, fact.get("method"))[name] == value, name
         if fact["status"] == "as published":
-            assert options_of(paper, None)[name] == value, f"{name}: published, but not the default"
+            assert options_of(paper, None, fact.get("method"))[name] == value, f"{name}: published, but not the default"
     for size, numbers in fact.get("weights", {}).items():
         assert count_weights(paper, preset, size) == numbers, size
         for number in numbers:

@@ -48,7 +48,7 @@ def test_filters_are_scored_and_timed(tmp_path, capsys, monkeypatch):
             timed = f"{name} is left out" not in said
             assert re.fullmatch(r"\d+ \((\d+\.\d\d|nan)\) \|" if timed else r" ?\|", row[-1])
     assert {row[-1].strip() for row in rows if row[0] == f"| {NOISY}"} == {"|"}
-    # The page of results takes what is written for it: PSNR and FLIP of both lights, as in the table.
+    # The page of results takes what is written for it: PSNR of both lights, as in the table.
     page = results_page(read_results(tmp_path / "out"))
     (shown,) = (line for line in page.splitlines() if line.startswith(f"| `{FILTER}` | ") and line.count("|") == 10)
     psnr = [row[1] for row in rows if row[0] == f"| {FILTER}"]

@@ -196,7 +196,10 @@ def describe(
 ) -> dict[str, dict[str, Any]]:
     """Name of a file -> its measurement in the format of docs/results: the error, and the response."""
     clips = f"Clips of what the papers fail at, {settings.width} x {settings.height}, 1 sample of all reflected light; "
-    clips += "something moves for eight frames and then rests. "
+    clips += (
+        "something moves for eight frames and then rests. Networks without shipped weights (`ntasd`, `dasr`, `rae`, "
+    )
+    clips += "`arae`) are left out. "
     pixels = ", ".join(f"{name} {count['affected']}" for name, count in counts.items())
     error = "PSNR in dB of the affected pixels while it moves: those that were hidden, or whose light differs by a "
     error += f"quarter from that of their surface a frame ago ({pixels})."
@@ -208,8 +211,7 @@ def describe(
     response = (
         "Frames at rest until less than a tenth of the image before is left, in the pixels that changed last, over "
         "what the same method shows that begins there; 0: the first frame; never: not within "
-        f"{settings.frames - MOVING} frames. Methods "
-        "without shipped weights (`ntasd`, `dasr`, `rae`, `arae`) are left out."
+        f"{settings.frames - MOVING} frames."
     )
     title = "Failures that the papers name"
     errors = [[label, *(one.psnr for one in clips.values())] for label, clips in found.items()]

@@ -50,6 +50,7 @@ def claims(found: Results) -> list[Claim]:
     means, made = mean_scores(found), []
     for budget in BUDGETS:
         chosen, uniform, rotating = (stage_of_budget(kind, budget) for kind in (CHOSEN, UNIFORM, PATTERN))
+        count = f"{budget:g} sample{'s' * (budget != 1)}"
         pairs = {"chosen / uniform": (chosen, uniform)}
         if budget in ROTATING:
             pairs |= {"chosen / rotating": (chosen, rotating), "rotating / uniform": (rotating, uniform)}
@@ -57,9 +58,9 @@ def claims(found: Results) -> list[Claim]:
             ratio = error_ratio(found, *pair)
             stated = text == "chosen / uniform" and budget == PUBLISHED_BUDGET
             there, holds = ("0.66 to 0.75", ratio <= PUBLISHED) if stated else (NOT_STATED, None)
-            made.append(Claim(f"{text}, relative MSE, {budget:g} samples", there, f"{ratio:.2f}", holds))
+            made.append(Claim(f"{text}, relative MSE, {count}", there, f"{ratio:.2f}", holds))
         more = means[chosen].ms_per_frame - means[uniform].ms_per_frame
-        made.append(Claim(f"time of choosing, {budget:g} samples", NOT_STATED, f"{more:.1f} ms a frame"))
+        made.append(Claim(f"time of choosing, {count}", NOT_STATED, f"{more:.1f} ms a frame"))
     return made
 
 

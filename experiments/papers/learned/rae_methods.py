@@ -6,7 +6,7 @@ from experiments.papers.learned.scores import Claim, Table, ordinary, over_frame
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 
-RAE, ARAE = "rae of its paper", "arae of its paper"
+RAE, ARAE = "rae, its own loss", "arae, its own loss"
 ROWS = ("svgf", "asvgf", RAE, ARAE)
 
 

@@ -1,16 +1,16 @@
 """The papers' tables as measurements for the page of results (:mod:`experiments.measurement`)."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from experiments.cycles.reference import decibels
-from experiments.measurement import describe_measurement
+from experiments.measurement import describe_measurement, round_finite
 from experiments.papers.learned.curves import METRICS, PICTURE, choose_frames, find_mean
 from experiments.papers.learned.scores import Table, rows_of
 from experiments.papers.learned.stages import FAMILIES, REFERENCE_SPP, STAGES, Settings
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import Scores, mean_scores
+from jaxdn.zoo.weights import shipped_names
 
 COLUMNS: Mapping[str, tuple[Callable[[Scores], float], int, str]] = {
     "PSNR": (lambda one: one.unbiased_psnr, 2, "higher"),
@@ -32,6 +32,8 @@ def record_table(one: Table, found: Results, settings: Settings) -> dict[str, An
     """A table as a measurement, with what holds of the paper's claims."""
     columns, rows, what = _scores_of(one, found) if one.figures is None else _figures_of(one.figures(found))
     what = f"{what} {_describe(settings)}"
+    if one.figures is None and (shipped := [row for row in one.rows if row in shipped_names()]):
+        what += f" {', '.join(f'`{row}`' for row in shipped)}: shipped weights, of other clips and far more updates."
     if any(STAGES[row].start for row in one.rows if row in STAGES):
         what += " Networks of smaller budgets go on from those of the next larger one and so have had more updates."
     title = one.heading + (", as published" if settings.as_published else "")
@@ -51,7 +53,7 @@ def record_table(one: Table, found: Results, settings: Settings) -> dict[str, An
 def _scores_of(one: Table, found: Results) -> _Made:
     """A row a method, its means over the test clips."""
     rows = [
-        [f"`{label}`", *(_round(value(scores), decimals) for value, decimals, _ in COLUMNS.values())]
+        [f"`{label}`", *(round_finite(value(scores), decimals) for value, decimals, _ in COLUMNS.values())]
         for label, scores in mean_scores(rows_of(found, one.rows)).items()
     ]
     columns = [{"name": title, "decimals": decimals, "best": best} for title, (_, decimals, best) in COLUMNS.items()]
@@ -101,13 +103,13 @@ def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: 
 
 def _describe(settings: Settings) -> str:
     """The clips and the training, and with ``--as-published`` what of it is not the papers'."""
-    size, rooms = f"{settings.size} x {settings.size}", " and rooms" if settings.rooms else ""
+    families, rooms = len(FAMILIES) + len(settings.rooms), " and rooms" if settings.rooms else ""
     how = "By the presets and recipes of their papers, but for" if settings.as_published else "Trained by"
     return (
-        f"{how} {settings.steps} updates of the networks (small ones where they are not called large) on windows of "
-        f"{settings.frames} frames, on {settings.clips} clips of 8 frames of {size} pixels of each of "
-        f"{len(FAMILIES) + len(settings.rooms)} families{rooms}, with references of {REFERENCE_SPP} samples. Each "
-        "network was trained once: a tenth of a decibel is chance."
+        f"{how} {settings.steps} updates on windows of {settings.frames} frames; small networks where they are not "
+        f"called large. {settings.clips} clips of each of {families} families{rooms}, 8 frames of {settings.size} x "
+        f"{settings.size} pixels, with references of {REFERENCE_SPP} samples. Each network was trained once: a tenth "
+        "of a decibel is chance."
     )
 
 
@@ -122,7 +124,3 @@ def _command(settings: Settings) -> str:
     for name, places in (("rooms", settings.rooms), ("scenes", settings.scenes)):
         words += [f"--{name}", *(place.name for place in places)] if places else []
     return " ".join(words)
-
-
-def _round(value: float, decimals: int) -> float | None:
-    return round(float(value), decimals) if math.isfinite(value) else None

@@ -126,14 +126,15 @@ STAGES = {
     "dasr": Stage("dasr", {"size": "small"}, recipe="hasselgren"),
     "dasr, uniform": Stage("dasr", _EVEN, recipe="hasselgren"),
     "rae": Stage("rae", {"size": "small"}, recipe="hasselgren", preset="hasselgren"),
-    "rae of its paper": Stage("rae", {"size": "small"}, recipe="paper"),
-    "arae of its paper": Stage("arae", {"size": "small"}, recipe="paper"),
+    "rae, its own loss": Stage("rae", {"size": "small"}, recipe="paper"),
+    "arae, its own loss": Stage("arae", {"size": "small"}, recipe="paper"),
     **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
     **{f"ntasd, uniform, only {family}": _UNIFORM._replace(only=family) for family in HELD_OUT},
     **dict(_budget_stages()),
     **dict(_changed_stages()),
 }
-"""Each by the loss of its paper; those that Hasselgren et al. compare all by theirs, and ``rae`` as they have it."""
+"""Each by the loss of its paper; those that Hasselgren et al. compare all by theirs, and with
+``--as-published`` ``rae`` as they have it."""
 
 
 @dataclass
