@@ -137,7 +137,8 @@ def main(settings: Settings) -> None:
     own_ms = times.get(AGAINST, float("nan"))
     shown = {name: f"{ms:.0f} ({ms / own_ms:.2f})" for name, ms in times.items()}
     height, width = settings.timed
-    lines = [f"Milliseconds of a frame of {width} x {height} pixels, and in brackets against {AGAINST}."]
+    head = f"Milliseconds of a frame of {width} x {height} pixels, and in brackets against {AGAINST}."
+    lines = [head] if times else []
     errors: dict[str, Results] = {}
     for light, own in jobs.items():
         folders = [Path(job.folder) for job in own]
@@ -174,7 +175,7 @@ def record_errors(errors: Mapping[str, Results], settings: Settings) -> dict[str
     what = (
         f"{_describe_clips(settings, next(iter(errors.values())))}, with every buffer that any filter reads, 1 sample. "
         f"Errors but FLIP are without the references' noise ({settings.reference_spp} samples). `combiner` is made for "
-        "all light, not for indirect light alone."
+        "all light of filtered pixels; here rays go through pixel centres."
     )
     about = describe_measurement(
         "table", "All filters side by side", "Quality", 60, command=_command(settings), what=what, rows=rows
