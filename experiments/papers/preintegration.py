@@ -85,6 +85,7 @@ def main(settings: Settings) -> None:
 def record(found: Results, settings: Settings) -> dict[str, Any]:
     """A row a filter, a column a way to demodulate, as a measurement for the page of results."""
     means, ways = mean_scores(found), get_args(Demodulation)
+    places = [place.name if place.is_absolute() else str(place) for place in settings.clips]
     rows = []
     for name in filter_names():
         if f"{name}, {ways[0]}" in means:
@@ -96,7 +97,7 @@ def record(found: Results, settings: Settings) -> dict[str, Any]:
         "Demodulation factors",
         "Demodulation",
         100,
-        command=" ".join(["python -m experiments.papers.preintegration", *(place.name for place in settings.clips)]),
+        command=" ".join(["python -m experiments.papers.preintegration", *places]),
         what=f"{len(found.clips)} clips, 1 sample. PSNR / temporal PSNR / FLIP by the factor that light is divided by.",
         rows=rows,
     )
