@@ -189,6 +189,16 @@ def test_half_of_the_distance_that_a_paper_found_is_its_finding() -> None:
     ]
 
 
+def test_a_table_says_what_of_the_training_is_not_alike() -> None:
+    found = results_of(**{row: {"unbiased_psnr": 20.0} for row in zeng_methods.ROWS})
+    settings = stages.Settings(steps=70, as_published=True, tables=["zeng_methods"])
+    what = record_table(zeng_methods.TABLE, found, settings)["what"]
+    assert "but for 70 updates on windows of 5 frames" in what
+    assert "Adam's rates: `ntasd, uniform, 1 sample` 0.001, `ntd, 1 sample` 0.0001." in what
+    assert "`steady-balanced`: shipped weights" in what
+    assert "Adam's rates" not in record_table(zeng_methods.TABLE, found, stages.Settings())["what"]
+
+
 def test_the_loss_of_a_family_is_that_of_its_own_clips(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour", "mobile"))
     seen = ntasd_holdout.SEEN

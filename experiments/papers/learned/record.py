@@ -7,7 +7,7 @@ from experiments.cycles.reference import decibels
 from experiments.measurement import describe_measurement, round_finite
 from experiments.papers.learned.curves import METRICS, PICTURE, choose_frames, find_mean
 from experiments.papers.learned.scores import Table, rows_of
-from experiments.papers.learned.stages import FAMILIES, REFERENCE_SPP, STAGES, Settings
+from experiments.papers.learned.stages import FAMILIES, REFERENCE_SPP, STAGES, Settings, recipe_of
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import Scores, mean_scores
 from jaxdn.zoo.weights import shipped_names
@@ -32,6 +32,9 @@ def record_table(one: Table, found: Results, settings: Settings) -> dict[str, An
     """A table as a measurement, with what holds of the paper's claims."""
     columns, rows, what = _scores_of(one, found) if one.figures is None else _figures_of(one.figures(found))
     what = f"{what} {_describe(settings)}"
+    rates = {row: recipe_of(row, settings).learning_rate for row in one.rows if row in STAGES}
+    if len(set(rates.values())) > 1:
+        what += f" Adam's rates: {', '.join(f'`{row}` {rate:g}' for row, rate in rates.items())}."
     if one.figures is None and (shipped := [row for row in one.rows if row in shipped_names()]):
         what += f" {', '.join(f'`{row}`' for row in shipped)}: shipped weights, of other clips and far more updates."
     if any(STAGES[row].start for row in one.rows if row in STAGES):

@@ -11,6 +11,7 @@ from jaxdn.clips import find_clips
 from jaxdn.denoisers import taa
 from jaxdn.methods.registry import is_method, method_named
 from jaxdn.recipes.objectives import Objective, unbiased_illumination
+from jaxdn.recipes.recipe import Recipe
 from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import ClipSource, render
 from jaxdn.training.train import train
@@ -227,7 +228,21 @@ def trained(name: str, settings: Settings) -> Model:
 
 def _weights_of(name: str, settings: Settings) -> Path:
     """The file of a stage's weights, trained if they are not, and before them those that it starts from."""
-    stage = publish(STAGES[name]) if settings.as_published else STAGES[name]
+    stage, recipe = _find_stage(name, settings), recipe_of(name, settings)
+    method = method_named(stage.method)
+    start = None if stage.start is None else str(_weights_of(stage.start, settings))
+    clips = clips_of(stage, find_clips(settings.data / "train"))
+    out = settings.results / file_name(name)
+    return train(method, recipe, clips, out, options=stage.options, start=start, label=name)
+
+
+def _find_stage(name: str, settings: Settings) -> Stage:
+    return publish(STAGES[name]) if settings.as_published else STAGES[name]
+
+
+def recipe_of(name: str, settings: Settings) -> Recipe:
+    """How a stage is trained."""
+    stage = _find_stage(name, settings)
     method = method_named(stage.method)
     recipe = method.recipe_named(stage.recipe)
     recipe = recipe._replace(
@@ -235,15 +250,9 @@ def _weights_of(name: str, settings: Settings) -> Path:
         frames=settings.frames,
         crop=min(recipe.crop, settings.size),
         spp=(1,) if method.has_option("budget") else (stage.spp,),
+        objective=stage.objective or recipe.objective,
     )
-    if not settings.as_published:
-        recipe = recipe._replace(average=0.99)
-    if stage.objective is not None:
-        recipe = recipe._replace(objective=stage.objective)
-    start = None if stage.start is None else str(_weights_of(stage.start, settings))
-    clips = clips_of(stage, find_clips(settings.data / "train"))
-    out = settings.results / file_name(name)
-    return train(method, recipe, clips, out, options=stage.options, start=start, label=name)
+    return recipe if settings.as_published else recipe._replace(average=0.99)
 
 
 def clips_of(stage: Stage, folders: Sequence[Path]) -> list[Path]:
