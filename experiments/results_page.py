@@ -54,7 +54,8 @@ CLAIMS = """## What the papers claim
 
 The claims of all tables above. Each table says with which clips and how many updates it was made; the papers have whole
 scenes, and thousands of updates. *Holds*: in the range of the paper; where that has a distance, at least half of it;
-where it has no number, with its sign. *Not stated*: the paper has no such figure, and ours stands alone.
+where it has no number, with its sign. *Chance*: less than a tenth of a decibel. *Not stated*: the paper has no such
+figure, and ours stands alone.
 """
 
 Result = Mapping[str, Any]

@@ -337,6 +337,9 @@ def test_the_ablation_adds_dual_vectors_and_then_the_loss() -> None:
         ("+1.00 dB", True),
         ("-0.50 dB", False),
     ]
+    psnr[zeng_ablation.C] = 21.09
+    found = results_of(**{row: {"disoccluded_psnr": value} for row, value in psnr.items()})
+    assert [claim.verdict for claim in zeng_ablation.claims(found)] == ["holds", "chance"]
 
 
 def test_as_published_filters_have_the_presets_of_their_papers() -> None:

@@ -4,7 +4,7 @@ The numbers of the paper are relative MSE at four samples of SunTemple, Classroo
 are trained by one loss.
 """
 
-from experiments.papers.learned.scores import Claim, Table, error_ratio, ordinary, over_frames, psnr_gain
+from experiments.papers.learned.scores import Claim, Table, error_ratio, is_gain, ordinary, over_frames, psnr_gain
 from experiments.papers.learned.stages import AFTERWARDS
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
@@ -43,13 +43,13 @@ def claims(found: Results) -> list[Claim]:
         Claim(
             "direct prediction / kernels, single frames, relative MSE", "1.7 to 2.1", f"{direct:.2f}", direct >= 1.35
         ),
-        Claim("NTASD is steadier than DASR, temporal PSNR", "above 0", f"{steadier:+.2f} dB", steadier > 0),
-        Claim("TAA makes RAE steadier, temporal PSNR", "above 0", f"{smoothed:+.2f} dB", smoothed > 0),
+        Claim("NTASD is steadier than DASR, temporal PSNR", "above 0", f"{steadier:+.2f} dB", is_gain(steadier)),
+        Claim("TAA makes RAE steadier, temporal PSNR", "above 0", f"{smoothed:+.2f} dB", is_gain(smoothed)),
         Claim(
             "NTASD is better than RAE, PSNR",
             "above 0",
             f"{psnr_gain(found, 'ntasd', 'rae'):+.2f} dB",
-            psnr_gain(found, "ntasd", "rae") > 0,
+            is_gain(psnr_gain(found, "ntasd", "rae")),
         ),
     ]
 

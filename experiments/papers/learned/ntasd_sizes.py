@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from experiments.papers.learned.scores import Claim, Table, ordinary, psnr_gain
+from experiments.papers.learned.scores import Claim, Table, is_gain, ordinary, psnr_gain
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 
@@ -39,10 +39,10 @@ def claims(found: Results) -> list[Claim]:
     return [
         Claim("the large network is better, PSNR", "0.6 dB", f"{worth:+.2f} dB", worth >= 0.3),
         Claim("and slower, without samplers", f"{there:.1f} times", f"{slower:.1f} times", slower >= (1 + there) / 2),
-        Claim("kernels in place of colours, single frames, PSNR", "above 0", f"{steps[0]:+.2f} dB", steps[0] > 0),
-        Claim("the last image, PSNR", "above 0", f"{steps[1]:+.2f} dB", steps[1] > 0),
-        Claim("the last image, temporal PSNR", "above 0", f"{temporal:+.2f} dB", temporal > 0),
-        Claim("samples where they pay, PSNR", "above 0", f"{steps[2]:+.2f} dB", steps[2] > 0),
+        Claim("kernels in place of colours, single frames, PSNR", "above 0", f"{steps[0]:+.2f} dB", is_gain(steps[0])),
+        Claim("the last image, PSNR", "above 0", f"{steps[1]:+.2f} dB", is_gain(steps[1])),
+        Claim("the last image, temporal PSNR", "above 0", f"{temporal:+.2f} dB", is_gain(temporal)),
+        Claim("samples where they pay, PSNR", "above 0", f"{steps[2]:+.2f} dB", is_gain(steps[2])),
     ]
 
 

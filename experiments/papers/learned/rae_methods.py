@@ -2,7 +2,7 @@
 accumulation. Both autoencoders are trained by the loss of Chaitanya et al.
 """
 
-from experiments.papers.learned.scores import Claim, Table, ordinary, over_frames, psnr_gain
+from experiments.papers.learned.scores import Claim, Table, is_gain, ordinary, over_frames, psnr_gain
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 
@@ -22,7 +22,7 @@ def claims(found: Results) -> list[Claim]:
         better = psnr_gain(found, first, second)
         steadier = means[first].unbiased_temporal_psnr - means[second].unbiased_temporal_psnr
         ours = f"{better:+.2f} dB, temporal {steadier:+.2f} dB"
-        found_claims.append(Claim(f"{first} is better than {second}, PSNR", "above 0", ours, better > 0))
+        found_claims.append(Claim(f"{first} is better than {second}, PSNR", "above 0", ours, is_gain(better)))
     return found_claims
 
 

@@ -18,6 +18,8 @@ from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 from jaxdn.zoo.ready import find_model
 
+CHANCE = 0.1
+"""Decibels by which two trainings of the same network differ."""
 NOT_STATED = "not stated"
 """What a paper says where it has no such figure."""
 
@@ -29,12 +31,14 @@ class Claim(NamedTuple):
     paper: str
     ours: str
     holds: bool | None = None
-    """None where the paper states nothing."""
+    """None where the paper states nothing, and where what was found may be chance."""
 
     @property
     def verdict(self) -> str:
         """Whether it holds, in words; nothing where the paper states nothing."""
-        return "" if self.holds is None else "holds" if self.holds else "not here"
+        if self.holds is None:
+            return "" if self.paper == NOT_STATED else "chance"
+        return "holds" if self.holds else "not here"
 
 
 class Table(NamedTuple):
@@ -125,6 +129,11 @@ def psnr_gain(found: Results, first: str, second: str) -> float:
     """Mean decibels of the first above the second."""
     means = mean_scores(found)
     return means[first].unbiased_psnr - means[second].unbiased_psnr
+
+
+def is_gain(decibels: float) -> bool | None:
+    """Whether it is one; None for what may be chance."""
+    return None if abs(decibels) < CHANCE else decibels > 0
 
 
 def claims_table(claims: Iterable[Claim]) -> str:

@@ -4,7 +4,7 @@ At one sample a pixel, and nothing else differs. The paper shows pictures; its c
 something was hidden.
 """
 
-from experiments.papers.learned.scores import Claim, Table, ordinary
+from experiments.papers.learned.scores import Claim, Table, is_gain, ordinary
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 
@@ -26,7 +26,7 @@ def claims(found: Results) -> list[Claim]:
         "dual vectors, disoccluded PSNR": means[B].disoccluded_psnr - means[A].disoccluded_psnr,
         "the motion-occlusion loss, disoccluded PSNR": means[C].disoccluded_psnr - means[B].disoccluded_psnr,
     }
-    return [Claim(text, "above 0", f"{gain:+.2f} dB", gain > 0) for text, gain in gains.items()]
+    return [Claim(text, "above 0", f"{gain:+.2f} dB", is_gain(gain)) for text, gain in gains.items()]
 
 
 TABLE = Table("Zeng et al. 2021, sec. 6.3: vectors and loss", ROWS, text, claims, spp=1)
