@@ -10,13 +10,14 @@ Denoising", 2020 ("Hasselgren et al. 2020" here).
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 
 from jaxdn import color
 from jaxdn.core.frame import Frame
+from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, Pattern, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature
@@ -42,6 +43,9 @@ class Options(ntd.Options, Sampling):
     heads say; with its nearest U both are its eq. 3."""
     up: Literal["bilinear", "nearest"] = "nearest"
     """The upsampling U of coarser scales."""
+    memory: Annotated[int, Range(0)] = 0
+    """Numbers a pixel that the denoiser keeps for itself beside the last image, warped as it is: 64 in sec. 3.2, where
+    they lose 0.2 dB."""
     pattern: Literal["random", "rotating"] = "random"
     """Where fractions of samples are rounded up (``rounding="stochastic"``): at random, or in a fixed pattern that
     rotates from frame to frame (:func:`jaxdn.ops.sampling.rotate_pattern`)."""
@@ -71,7 +75,8 @@ def ntasd(options: Options) -> Denoiser:
     roughness, too. Raises ValueError for an unknown option and for a budget that the layers cannot give, and ``step``
     for a frame of the wrong shape, never for its contents.
     """
-    inner = ntd.core_of(options, ntd.ExtraFeatures((2, 1), _sample_features, frozenset({"motion", "sample_count"})))
+    extra = ntd.ExtraFeatures((2, 1), _sample_features, frozenset({"motion", "sample_count"}))
+    inner = ntd.core_of(options, extra, memory=options.memory)
     flagged = options.missing_history == "current"
     built: dict[str, Any] = {name: getattr(options, name) for name in ("size", "initialization", "implementation")}
     network = sampler(options, (1, 1, 3, 1, 2, *([1] if flagged else [])), allocate=allocate_samples, **built)
@@ -93,7 +98,7 @@ def ntasd(options: Options) -> Denoiser:
         dark = frame._replace(radiance=jnp.zeros_like(frame.radiance))  # nothing is rendered yet
         if not options.adaptive:
             return allocate_samples(options, dark.radiance[..., :1], most)
-        past, absent, _ = ntd.warp_history(options, state, dark, first)
+        past, absent, _ = ntd.warp_history(options, state[..., :3], dark, first)
         gain = color.exposure(past) if options.exposure == "measured" else 1.0
         scale = measure_frame(past, frame.depth, frame).mean_depth if options.depth_scale == "geometric" else 1.0
         features = [

@@ -187,6 +187,15 @@ def warp_history(
     return history, absent, invalid
 
 
+def warp_memory(options: Options, memory: jax.Array, frame: Frame, first: jax.Array) -> jax.Array:
+    """What the network kept for itself [H, W, n] along the motion vectors; 0 where there is none, or outside."""
+    if options.history == "none":
+        return jnp.zeros_like(memory)
+    memory = jnp.where(first, 0.0, jnp.clip(jnp.nan_to_num(memory), -1.0, 1.0))
+    vectors = choose_vectors(frame, options.motion)
+    return memory if vectors is None else warp(memory, jax.lax.stop_gradient(vectors), border="zeros")
+
+
 def fill_background(frame: Frame, hit: jax.Array) -> jax.Array:
     """The radiance [H, W, 3] of pixels without a surface, where ``hit`` [H, W] is false.
 
@@ -265,16 +274,21 @@ class PreparedFrame(NamedTuple):
 NO_EXTRA_FEATURES = ExtraFeatures()
 
 
-def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
+def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES, *, memory: int = 0) -> Core:
     """The method without division and shared processing; its state is the last image [H, W, 3].
+
+    With ``memory`` the network has so many numbers a pixel of its own in the state, behind the image: its outputs in
+    [-1, 1], which are warped as the image is and enter with the next frame.
 
     Where ``sample_count`` is among the buffers read, pixels without samples are filled from their neighbours.
     """
     flagged, materials = options.missing_history == "current", options.guides == "materials"
     # What is optional comes last: weights trained without it can be continued with it.
     groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []), *extra.groups)
+    groups = (*groups, memory) if memory else groups
     fine, direct = options.alpha_at == "fine", options.prediction == "direct"
-    heads = heads_of(options.prediction, fine=fine)
+    kernels = heads_of(options.prediction, fine=fine)
+    heads = (kernels[0] + memory, *kernels[1:])
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
@@ -296,7 +310,7 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
         return {**params, "guide": initial_precisions(options.guides)} if guided else params
 
     def start(params: Params, frame: Frame) -> jax.Array:
-        return jnp.zeros_like(frame.radiance)
+        return jnp.zeros((*frame.radiance.shape[:2], 3 + memory), frame.radiance.dtype)
 
     def predict(params: Params, features: list[jax.Array | None], dtype: jnp.dtype) -> list[jax.Array]:
         """The heads [H, W, c] for feature groups [H, W, c]."""
@@ -322,7 +336,7 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         frame, noisy, hit = prepared
         size = frame.radiance.shape[:2]
-        history, absent, invalid = warp_history(options, state, frame, first)
+        history, absent, invalid = warp_history(options, state[..., :3], frame, first)
         guides = _guides(options, frame, statistics)
         history, absent = pad(history, MULTIPLE), pad(absent, MULTIPLE)
         if hit is not None:
@@ -335,7 +349,11 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
         if materials:
             features += [guides["reflectance"], guides["roughness"]]
         features += [None if feature is None else pad(feature, MULTIPLE) for feature in extra.of(frame)]
+        if memory:
+            features.append(pad(warp_memory(options, state[..., 3:], frame, first), MULTIPLE))
         predicted = predict(params, features, noisy.dtype)
+        full, kept = jnp.split(predicted[0], [kernels[0]], axis=-1)
+        predicted = [full, *predicted[1:]]
 
         if direct:
             image = color.expand(predicted[0]) / gain
@@ -344,7 +362,8 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
             image = blend(options, predicted, prior, noisy, history, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
         shown = image if hit is None else jnp.where(hit[..., None], image, fill_background(frame, hit))
-        return image, shown, invalid
+        state = jnp.concatenate([image, crop(jnp.tanh(kept), size)], axis=-1) if memory else image
+        return state, shown, invalid
 
     field = graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=3)) + _FILTERS_FIELD
     return Core(start, step, reads, init, prepare=prepare, receptive_field=field)

@@ -64,8 +64,8 @@ def init_bias(params: Params, prediction: Prediction, *, fine: bool) -> Params:
         return init_grey(params, "head_0")
     biases: list[tuple[str, int, float]] = []
     if prediction != "one-scale":
-        seams = (("head_0", -1), ("head_1", -1)) if fine else (("head_1", -1), ("head_2", -1))
-        biases = [(*seam, 2.0) for seam in seams]
+        channels = heads_of(prediction, fine=fine)  # a head may have more, of other things, behind these
+        biases = [(f"head_{index}", channels[index] - 1, 2.0) for index in ((0, 1) if fine else (1, 2))]
     if prediction == "temporal":
         biases.append(("head_0", 2 * TAPS, -2.0))
     for head, channel, bias in biases:

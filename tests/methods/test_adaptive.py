@@ -13,6 +13,7 @@ import pytest
 from jaxdn.core.frame import FAR, Clip, Frame, frame_at, only
 from jaxdn.denoiser import Denoiser, Recurrent, State
 from jaxdn.denoiser.rollout import denoise, render_requested, unroll
+from jaxdn.methods import ntd
 from jaxdn.methods.dasr import dasr
 from jaxdn.methods.ntasd import ntasd
 from jaxdn.methods.registry import methods
@@ -182,6 +183,42 @@ def test_of_the_paper_the_heads_are_51_26_and_26_channels(rng, key):
     denoiser = ntasd(size=TINY, preset="paper")
     heads = denoiser.init(key, frame_at(clip_of(rng).frames, 0))["denoiser"]
     assert [len(heads[f"head_{scale}"]["bias"]) for scale in range(3)] == [51, 26, 26]
+
+
+def test_what_the_network_keeps_is_fetched_where_the_surface_was(rng):
+    """By whole pixels, so that the fetch is a shift. It is 0 outside, in the first frame, and for NaN."""
+    memory = rng.uniform(-1, 1, size=(*SIZE, 4)).astype(np.float32)
+    memory[3, 5, 1] = np.nan
+    frame = Frame(jnp.zeros((*SIZE, 3)), motion=jnp.broadcast_to(jnp.float32([2, -1]), (*SIZE, 2)))
+    options = ntd.Options(motion="traditional")
+    found = np.asarray(ntd.warp_memory(options, jnp.asarray(memory), frame, jnp.asarray(False)))
+    expected = np.zeros_like(memory)
+    expected[1:, :-2] = memory[:-1, 2:]
+    np.testing.assert_allclose(found, np.nan_to_num(expected), atol=1e-6)
+    assert not np.any(ntd.warp_memory(options, jnp.asarray(memory), frame, jnp.asarray(True)))
+
+
+@pytest.mark.slow
+def test_the_network_learns_what_to_keep(rng, key):
+    """What it keeps is its own output, and the next image depends on it."""
+    clip, denoiser = clip_of(rng, 2), ntasd(size=TINY, adaptive=False, budget=1.0, memory=4, **PLAIN)
+    params = varied(denoiser, clip, key)
+    frames = clip.frames._replace(sample_count=jnp.ones_like(clip.frames.depth))
+
+    @jax.jit
+    def slopes(params):
+        return jax.grad(lambda params: jnp.mean(unroll(denoiser, params, frames)[-1] ** 2))(params)
+
+    head = slopes(params)["denoiser"]["head_0"]["bias"]
+    assert head.shape == (2 * 25 + 2 + 4,)
+    assert np.all(np.abs(head[-4:]) > 0)
+    bias = params["denoiser"]["head_0"]["bias"].at[-4:].set(jnp.float32([0.5, -0.5, 9.0, 0.0]))
+    kernel = params["denoiser"]["head_0"]["kernel"].at[..., -4:].set(0.0)
+    fixed = {"denoiser": {**params["denoiser"], "head_0": {"kernel": kernel, "bias": bias}}}
+    first = only(frame_at(frames, 0), denoiser.reads)
+    state, _ = jax.jit(denoiser.step)(fixed, denoiser.start(fixed, first), first)
+    kept = next(leaf for leaf in jax.tree.leaves(state) if leaf.ndim == 3)[..., 3:]
+    np.testing.assert_allclose(kept, np.broadcast_to(np.tanh([0.5, -0.5, 9.0, 0.0]), kept.shape), rtol=1e-5)
 
 
 @pytest.mark.slow
