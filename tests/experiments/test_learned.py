@@ -219,9 +219,9 @@ def test_the_loss_of_a_family_is_that_of_its_own_clips(monkeypatch: pytest.Monke
 
 
 def test_the_ladder_is_climbed_step_by_step() -> None:
-    psnr = {ntasd_sizes.LARGE: 27.5, ntasd_sizes.UNIFORM_LARGE: 26.5} | dict(
-        zip(ntasd_sizes.LADDER, (20, 24, 25, 25), strict=True)
-    )
+    psnr = {ntasd_sizes.LARGE: 27.5, ntasd_sizes.UNIFORM_LARGE: 26.5, ntasd_sizes.TENTH: 25.0}
+    psnr |= {ntasd_sizes.FEATURES: 24.8, ntasd_sizes.RAE: 24.0}
+    psnr |= dict(zip(ntasd_sizes.LADDER, (20, 24, 25, 25), strict=True))
     given = {
         label: {"unbiased_psnr": float(value), "unbiased_temporal_psnr": 25.0, "ms_per_frame": 10.0}
         for label, value in psnr.items()
@@ -231,10 +231,14 @@ def test_the_ladder_is_climbed_step_by_step() -> None:
     assert claims["the last image, PSNR"].ours == "+1.00 dB"
     assert not claims["the last image, temporal PSNR"].holds
     assert not claims["samples where they pay, PSNR"].holds
-    assert claims["the large network is better, PSNR"].ours == "+2.50 dB"
-    # 42 and 14 ms are those of networks with samplers; what is measured here has none: 21 + 1 and 10 + 1.
-    assert claims["and slower, without samplers"].paper == "2.0 times"
-    assert not claims["and slower, without samplers"].holds  # 10 ms and 10 ms
+    better = claims["the large network is better than a tenth of RAE's weights"]
+    assert (better.ours, better.holds) == ("+2.50 dB", True)
+    # With samplers: 20 + 21 + 1 and 3 + 10 + 1 ms.
+    assert claims["and slower"].paper == "3.0 times"
+    assert not claims["and slower"].holds  # 10 ms and 10 ms
+    assert claims["a tenth of RAE's weights are better than RAE, PSNR"].ours == "+1.00 dB"
+    lost = claims["64 features that recur, PSNR"]
+    assert (lost.ours, lost.holds) == ("-0.20 dB", True)
     given[ntasd_sizes.LARGE]["unbiased_psnr"] = 25.2
     worth = ntasd_sizes.claims(results_of(**given))[0]
     assert (worth.ours, worth.holds) == ("+0.20 dB", False)  # a third of the paper's 0.6 dB
@@ -247,6 +251,10 @@ def test_stages_are_what_the_papers_compare() -> None:
         assert stages.STAGES[row].options["adaptive"] is False
     assert stages.STAGES[ntasd_sizes.LADDER[2]].options["adaptive"] is False
     assert "adaptive" not in stages.STAGES[ntasd_sizes.LADDER[3]].options
+    tenth = method_named("ntasd").factory(**stages.publish(stages.STAGES[ntasd_sizes.TENTH]).options)
+    params = jax.eval_shape(lambda: tenth.init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3)))))
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == pytest.approx(2.6e6 / 10, rel=0.01)
+    assert stages.STAGES[ntasd_sizes.FEATURES].options == {"memory": 64, **stages.STAGES["ntasd, uniform"].options}
     zeng = {row: stages.STAGES[row] for row in (zeng_methods.THEIRS, zeng_methods.NTASD)}
     assert zeng_methods.TABLE.spp == zeng[zeng_methods.THEIRS].spp == zeng[zeng_methods.NTASD].options["budget"] == 1
     assert stages.objective_of(zeng_methods.NTASD) == "last frames"

@@ -108,13 +108,18 @@ def _changed_stages() -> Iterator[tuple[str, Stage]]:
         yield stage_of_changes(chosen), Stage("ntd", options, recipe="paper-loss", spp=1, objective=objective)
 
 
+TENTH = ((10,), (20, 20), (26, 26), (34, 34), (34, 34))
+"""Widths of both networks of ``ntasd`` with 261,020 weights: Hasselgren et al. 2020 say of their small ones that they
+have ten times fewer than RAE, which has 2.6 million there."""
 _SINGLE_FRAMES = {**_EVEN, "history": "none"}
 _UNIFORM = Stage("ntasd", _EVEN, recipe="paper")
 _WITHOUT = "paper-loss-without-occlusion"
 STAGES = {
     "ntasd": Stage("ntasd", {"size": "small"}, recipe="paper"),
     "ntasd, large": Stage("ntasd", {"size": "large"}, recipe="paper"),
+    "ntasd, tenth": Stage("ntasd", {"size": TENTH}, recipe="paper"),
     "ntasd, uniform": _UNIFORM,
+    "ntasd, uniform, 64 features": Stage("ntasd", {**_EVEN, "memory": 64}, recipe="paper"),
     "ntasd, uniform, large": Stage("ntasd", {"size": "large", "adaptive": False}, recipe="paper"),
     "single frames, three scales": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "three-scales"}, recipe="paper"),
     "single frames, direct": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "direct"}, recipe="paper"),
