@@ -22,6 +22,7 @@ from experiments.papers.learned import (
     ntasd_methods,
     ntasd_sizes,
     rae_methods,
+    small_lights,
     scores,
     stages,
     zeng_ablation,
@@ -85,16 +86,23 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     monkeypatch.setattr(scores, "near", cache(scores.near.__wrapped__))
     # Of each clip, as many frames as give a network a history after its two, and what these methods read.
     monkeypatch.setattr(stages, "render", lambda source, *how, **more: render(source._replace(frames=3), *how, **more))
-    for module in (stages, curves):
+    monkeypatch.setattr(small_lights, "FRAMES", 3)
+    monkeypatch.setattr(small_lights, "READERS", "svgf")
+    for module in (stages, curves, small_lights):
         monkeypatch.setattr(module, "LAYERS", (1, 2, 4, 8))
+    for module in (stages, curves):
         monkeypatch.setattr(module, "COMPARED", "svgf")
     monkeypatch.setattr(stages, "TRAINED", "svgf")
     seen = ntasd_holdout.SEEN
     rows = (seen, f"{seen}, only parlour", f"{seen}, without parlour")
+    lit = stages.stage_of_budget(ntasd_budgets.CHOSEN, 4)
     tables = {
         "ntasd_holdout": ntasd_holdout.TABLE._replace(rows=rows),
         "small": scores.Table("One", ("ntasd",), lambda found: scores.ordinary(found, ["ntasd"]), no_claims),
         "single": scores.Table("Two", ("svgf",), lambda found: scores.ordinary(found, ["svgf"]), no_claims, spp=1),
+        "lights": scores.Table(
+            "Three", (lit,), lambda found: scores.ordinary(found, [lit]), no_claims, clips="small lights"
+        ),
     }
     monkeypatch.setattr(learned, "TABLES", tables)
     monkeypatch.setattr(curves, "FAMILY", "fruit")
@@ -109,9 +117,14 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     assert re.search(r"\| fruit-2000 \| -?\d\.\d\d, \d+ to \d+ \|", text), text
     for name in ("ntasd-samples", "noise", "svgf"):
         assert (tmp_path / "runs" / "pictures" / "fruit-2000" / f"{name}.png").is_file()
-    for folder in ("", "1-samples"):
+    for folder in ("", "1-samples", "small-lights"):
         assert (tmp_path / "runs" / folder / "report.html").is_file()
     assert re.search(r"## Two, 1 sample a pixel\n\n.*\n.*\n\| svgf \| \d", text), text
+    assert re.search(rf"## Three, 4 samples a pixel\n\n.*\n.*\n\| {lit} \| \d", text), text
+    trained_on = sorted(folder.name for folder in (tmp_path / "data" / "small-lights" / "train").glob("*-*"))
+    assert trained_on == [f"small-lights-{seed}" for seed in range(4)]
+    record = json.loads((tmp_path / "data" / "small-lights" / "test" / "small-lights-2000" / "clip.json").read_text())
+    assert record["light"] == "reflected"
     drawn = json.loads((tmp_path / "runs" / "curves.json").read_text())
     assert [len(drawn["ntasd"][name]) for name in ("ssim", "mse")] == [4, 4]
     assert min(drawn["ntasd"]["mse"]) > 0

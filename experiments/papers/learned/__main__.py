@@ -8,6 +8,7 @@ scenes that none has seen. Writes ``runs/papers/report.md`` with every table and
 image, maps of samples, and in ``measurements`` each table in the format of docs/results.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import tyro
@@ -26,8 +27,9 @@ from experiments.papers.learned.curves import make_table, measure_curves
 from experiments.papers.learned.maps import asks, save_maps
 from experiments.papers.learned.record import record_curves, record_table
 from experiments.papers.learned.scores import Table, claims_table, read
-from experiments.papers.learned.stages import BUDGET, Settings, ready, render_all
-from experiments.papers.preintegration import save_pictures
+from experiments.papers.learned.small_lights import render_small_lights
+from experiments.papers.learned.stages import BUDGET, Clips, Settings, ready, render_families
+from experiments.papers.preintegration import file_name, save_pictures
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import Results, write_report
@@ -46,6 +48,11 @@ TABLES = {
         zeng_changes,
     )
 }
+RENDERERS: dict[Clips, Callable[[Settings], list[Path]]] = {
+    "families": render_families,
+    "small lights": render_small_lights,
+}
+"""What a table is tested on -> how it is rendered, with what is trained on; the folders of the former."""
 REFERENCES = ("noisy", "svgf", "steady-balanced")
 """In every run, whatever the tables."""
 
@@ -65,12 +72,13 @@ def sections(tables: list[Table], found: Results) -> list[str]:
 def main(settings: Settings) -> None:
     """Render, train, compare, report. Raises ValueError for an unknown table."""
     tables = tables_named(settings.tables)
-    folders = render_all(settings)
+    folders = {clips: render(settings) for clips, render in RENDERERS.items() if clips in {one.clips for one in tables}}
     how = ", as published" if settings.as_published else ""
     text = [f"# The papers' tables after {settings.steps} updates{how}"]
-    text += [f"{len(folders)} test clips. Means without the noise of the references, but for FLIP, L1 and SSIM."]
-    for spp in sorted({one.spp for one in tables}, reverse=True):
-        text += compared([one for one in tables if one.spp == spp], folders, settings, spp)
+    text += ["Means over the test clips without the noise of the references, but for FLIP, L1 and SSIM."]
+    for clips, spp in sorted({(one.clips, one.spp) for one in tables}, key=lambda pair: (pair[0], -pair[1])):
+        alike = [one for one in tables if (one.clips, one.spp) == (clips, spp)]
+        text += compared(alike, folders[clips], settings, out_of(clips, spp, settings))
     if settings.curve_frames:
         curves = measure_curves(settings)
         write_json(settings.results / "curves.json", curves)
@@ -82,13 +90,19 @@ def main(settings: Settings) -> None:
     print(f"\nreport: {report}")
 
 
-def compared(tables: list[Table], folders: list[Path], settings: Settings, spp: int) -> list[str]:
-    """The sections of the tables with so many samples a pixel; their report and pictures are written."""
+def out_of(clips: Clips, spp: int, settings: Settings) -> Path:
+    """The folder of the report on these clips at so many samples a pixel."""
+    place = settings.results if clips == "families" else settings.results / file_name(clips)
+    return place if spp == BUDGET else place / f"{spp}-samples"
+
+
+def compared(tables: list[Table], folders: list[Path], settings: Settings, out: Path) -> list[str]:
+    """The sections of tables of the same clips and samples a pixel; writes their report and pictures to ``out``."""
+    spp = tables[0].spp
     rows = dict.fromkeys([*REFERENCES, *(row for one in tables for row in one.rows)])
     methods = [ready(row, settings) for row in rows]
     title = f"The papers' tables after {settings.steps} updates, {spp} samples a pixel"
     found = compare(methods, folders, title=title, settings={"clips": len(folders)}, spp=spp, read=read)
-    out = settings.results if spp == BUDGET else settings.results / f"{spp}-samples"
     write_report(found, out)
     save_pictures(found, out / "pictures")
     for name, one in TABLES.items():

@@ -64,4 +64,4 @@ def claims(found: Results) -> list[Claim]:
     return made
 
 
-TABLE = Table("Samples where they pay, by budget", ROWS, text, claims, budgets=True)
+TABLE = Table("Samples where they pay, by budget", ROWS, text, claims, budgets=True, clips="small lights")

@@ -7,7 +7,7 @@ from experiments.cycles.reference import decibels
 from experiments.measurement import describe_measurement, round_finite
 from experiments.papers.learned.curves import METRICS, PICTURE, choose_frames, find_mean
 from experiments.papers.learned.scores import Table, rows_of
-from experiments.papers.learned.stages import FAMILIES, REFERENCE_SPP, STAGES, Settings, recipe_of
+from experiments.papers.learned.stages import FAMILIES, REFERENCE_SPP, STAGES, Clips, Settings, recipe_of
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import Scores, mean_scores
 from jaxdn.zoo.weights import shipped_names
@@ -31,7 +31,7 @@ _Made = tuple[list[dict[str, Any]], list[list[Any]], str]
 def record_table(one: Table, found: Results, settings: Settings) -> dict[str, Any]:
     """A table as a measurement, with what holds of the paper's claims."""
     columns, rows, what = _scores_of(one, found) if one.figures is None else _figures_of(one.figures(found))
-    what = f"{what} {_describe(settings)}"
+    what = f"{what} {_describe(settings, one.clips)}"
     rates = {row: recipe_of(row, settings).learning_rate for row in one.rows if row in STAGES}
     if len(set(rates.values())) > 1:
         what += f" Adam's rates: {', '.join(f'`{row}` {rate:g}' for row, rate in rates.items())}."
@@ -104,13 +104,17 @@ def record_curves(found: Mapping[str, Mapping[str, Sequence[float]]], settings: 
     return {**described, "columns": columns, "picture": picture}
 
 
-def _describe(settings: Settings) -> str:
+def _describe(settings: Settings, clips: Clips = "families") -> str:
     """The clips and the training, and with ``--as-published`` what of it is not the papers'."""
     families, rooms = len(FAMILIES) + len(settings.rooms), " and rooms" if settings.rooms else ""
+    trained_on = {
+        "families": f"{settings.clips} clips of each of {families} families{rooms}",
+        "small lights": f"{4 * settings.clips} clips, of all reflected light, of rooms with a small lamp",
+    }[clips]
     how = "By the presets and recipes of their papers, but for" if settings.as_published else "Trained by"
     return (
         f"{how} {settings.steps} updates on windows of {settings.frames} frames; small networks where they are not "
-        f"called large. {settings.clips} clips of each of {families} families{rooms}, 8 frames of {settings.size} x "
+        f"called large. {trained_on}, 8 frames of {settings.size} x "
         f"{settings.size} pixels, with references of {REFERENCE_SPP} samples. Each network was trained once: a tenth "
         "of a decibel is chance."
     )

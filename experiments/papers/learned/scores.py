@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.papers import results
-from experiments.papers.learned.stages import BUDGET, objective_of
+from experiments.papers.learned.stages import BUDGET, Clips, objective_of
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.evaluation.compare import EvaluationClip, read_evaluation_clip
@@ -54,6 +54,8 @@ class Table(NamedTuple):
     """Samples a pixel of what the methods are given."""
     budgets: bool = False
     """Whether the methods differ by their samples a pixel."""
+    clips: Clips = "families"
+    """What the methods are tested on."""
     figures: Callable[[Results], list[dict[str, str | float]]] | None = None
     """The rows of the page of results, column -> value; None: the scores of all methods."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from experiments.papers import rooms
 from experiments.papers.preintegration import file_name
@@ -30,6 +30,9 @@ TRAINED = "ntd,rae,arae,ntasd,dasr,svgf,steady"
 COMPARED = f"{TRAINED},asvgf,trmv"
 """The methods whose buffers the test clips have."""
 TEST_SEED = 2000
+Clips = Literal["families", "small lights"]
+"""What is trained and tested on: rooms and things of :data:`FAMILIES`, of which indirect light is rendered, or what
+:mod:`experiments.papers.learned.small_lights` renders."""
 
 
 class Stage(NamedTuple):
@@ -51,6 +54,8 @@ class Stage(NamedTuple):
     """The stage whose weights are its first ones; None: new weights."""
     objective: Objective | None = None
     """Instead of the recipe's."""
+    clips: Clips = "families"
+    """What it is trained on."""
 
 
 _EVEN = {"size": "small", "adaptive": False}
@@ -80,7 +85,10 @@ def _budget_stages() -> Iterator[tuple[str, Stage]]:
         for kind, options in kinds.items():
             before = "ntasd, uniform" if kind == "ntasd, rotating" and larger not in ROTATING else kind
             start = None if larger is None else stage_of_budget(before, larger)
-            yield stage_of_budget(kind, budget), Stage("ntasd", options, recipe="paper", start=start)
+            yield (
+                stage_of_budget(kind, budget),
+                Stage("ntasd", options, recipe="paper", start=start, clips="small lights"),
+            )
 
 
 CHANGES: dict[str, dict[str, Any]] = {
@@ -184,7 +192,12 @@ class Settings:
         return folder
 
 
-def render_all(settings: Settings) -> list[Path]:
+def place_of(clips: Clips, settings: Settings) -> Path:
+    """The folder of these clips: those to train on are in ``train``, those to test on in ``test``."""
+    return settings.data if clips == "families" else settings.data / file_name(clips)
+
+
+def render_families(settings: Settings) -> list[Path]:
     """Render what is missing: clips to train on, of seeds from 0 on, and to test on, which are returned."""
     own = RenderSettings(settings.size, settings.size, layers=LAYERS, draws=BUDGET, reference_spp=REFERENCE_SPP)
     seeds, place = list(range(settings.clips)), settings.data / "train"
@@ -236,7 +249,7 @@ def _weights_of(name: str, settings: Settings) -> Path:
     stage, recipe = _find_stage(name, settings), recipe_of(name, settings)
     method = method_named(stage.method)
     start = None if stage.start is None else str(_weights_of(stage.start, settings))
-    clips = clips_of(stage, find_clips(settings.data / "train"))
+    clips = clips_of(stage, find_clips(place_of(stage.clips, settings) / "train"))
     out = settings.results / file_name(name)
     return train(method, recipe, clips, out, options=stage.options, start=start, label=name)
 
