@@ -293,7 +293,9 @@ def test_budgets_compare_what_differs_in_the_place_of_samples_alone() -> None:
             stages.STAGES[stages.stage_of_budget(kind, budget)]
             for kind in (ntasd_budgets.CHOSEN, ntasd_budgets.UNIFORM)
         )
-        assert uniform.options == chosen.options | {"adaptive": False}
+        assert chosen.clips == uniform.clips == ntasd_budgets.TABLE.clips == "small lights"
+        assert chosen.options["pattern"] == "rotating"
+        assert uniform.options | {"pattern": "rotating"} == chosen.options | {"adaptive": False}
         assert (chosen.options["budget"], chosen.options["least"], chosen.recipe) == (budget, 0, uniform.recipe)
         if budget in stages.ROTATING:
             rotating = stages.STAGES[stages.stage_of_budget(ntasd_budgets.PATTERN, budget)]

@@ -71,7 +71,7 @@ def stage_of_budget(kind: str, budget: float) -> str:
 
 
 def _budget_stages() -> Iterator[tuple[str, Stage]]:
-    """A network that chooses its pixels, one with pixels at random, and one with a pattern, for each budget.
+    """A network that chooses how many samples, one with pixels at random, and one with a pattern, for each budget.
 
     Each goes on from that of the next larger budget: new networks of a quarter of a sample stand still for hundreds of
     updates. So at each budget all have had the same number of updates.
@@ -79,7 +79,8 @@ def _budget_stages() -> Iterator[tuple[str, Stage]]:
     for budget, larger in zip(BUDGETS, [*BUDGETS[1:], None], strict=True):
         fractions = {"size": "small", "budget": budget, "least": 0, "rounding": "stochastic"}
         even = {**fractions, "adaptive": False}
-        kinds = {"ntasd": fractions, "ntasd, uniform": even}
+        # Below one sample the pattern alone is better than chance: what a network chooses is rounded by it, too.
+        kinds = {"ntasd": {**fractions, "pattern": "rotating"}, "ntasd, uniform": even}
         if budget in ROTATING:
             kinds["ntasd, rotating"] = {**even, "pattern": "rotating"}
         for kind, options in kinds.items():
