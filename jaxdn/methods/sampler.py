@@ -35,8 +35,8 @@ class Sampling:
     """A network says where samples go; or all pixels have the budget."""
     budget: Annotated[float, Range(0, without_low=True)] = 4.0
     """Mean number of samples per pixel."""
-    least: Annotated[int, Range(0)] = 1
-    """Every pixel has at least this many samples; 0 in the paper."""
+    least: Annotated[float, Range(0)] = 1
+    """Every pixel has at least this many samples; 0 in the paper. A whole number, but for ``rounding="stochastic"``."""
     rounding: Literal["exact", "nearest", "stochastic"] = "exact"
     """The budget is kept exactly, or about (as in the paper); or the map keeps fractions, which are rounded up with
     their probability when a frame is rendered: for budgets below one sample, with ``least`` 0. See

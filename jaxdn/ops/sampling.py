@@ -201,16 +201,16 @@ _ERROR = 1e-4
 """How far from a whole number a number of samples is taken for it."""
 
 
-def check_budget(budget: float, *, least: int, most: int) -> None:
+def check_budget(budget: float, *, least: float, most: int) -> None:
     """Raise ValueError for a mean number of samples that is not within the fewest and the most of a pixel."""
     if not (least <= budget <= most and budget > 0):
         raise ValueError(
-            f"budget: expected a mean number of samples above 0 from {least} to {most}, the fewest and the most that a "
-            f"pixel can have, got {budget:g}. A clip has as many as all its layers: `jaxdn render --layers 1 2 4 8`."
+            f"budget: expected a mean number of samples above 0 from {least:g} to {most}, the fewest and the most that "
+            f"a pixel can have, got {budget:g}. A clip has as many as all its layers: `jaxdn render --layers 1 2 4 8`."
         )
 
 
-def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, rounding: str = "exact") -> jax.Array:
+def sample_map(logits: jax.Array, budget: float, *, least: float = 0, most: int, rounding: str = "exact") -> jax.Array:
     """Numbers of samples [H, W, 1] from ``least`` to ``most``, ``budget`` in the mean: a softmax over the image.
 
     ``logits`` [H, W, 1]: samples are in proportion to their exponentials; what is not finite counts as 0, and what is
@@ -222,26 +222,32 @@ def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, r
       sum is ``round(M budget)``;
     * ``rounding="nearest"``: they are not scaled, only clamped and rounded, as in the paper: about that sum;
     * ``rounding="stochastic"``: they keep their fractions, for :func:`from_layers` with random numbers: ``budget`` in
-      the mean over pixels, and that many samples in the mean over random numbers.
+      the mean over pixels, and that many samples in the mean over random numbers. Every pixel has ``least``, which may
+      be a fraction, and what is left of the budget is placed: so none is out of reach of the gradient.
 
     The gradient is that of the softmax, times the scale; none flows where a number is clamped, and rounding passes it
-    on unchanged. Raises ValueError for a budget that is not within ``least`` and ``most``.
+    on unchanged. Raises ValueError for a budget that is not within ``least`` and ``most``, and for a ``least`` that is
+    not whole where the samples are.
     """
     check_image(logits, "logits", channels=1)
     check_option(rounding, "rounding", ("exact", "nearest", "stochastic"))
     check_budget(budget, least=least, most=most)
+    if rounding != "stochastic" and least != int(least):
+        raise ValueError(f"least: expected a whole number of samples, but with rounding 'stochastic', got {least:g}.")
     logits = jnp.asarray(logits)
     logits = jnp.where(jnp.isfinite(logits), logits, 0.0).astype(jnp.promote_types(logits.dtype, jnp.float32))
     logits = jnp.maximum(logits, lax.stop_gradient(jnp.max(logits)) - _REACH)
-    pixels = logits.size
-    shares = pixels * budget * jax.nn.softmax(logits.reshape(-1)).reshape(logits.shape)
+    shares = logits.size * jax.nn.softmax(logits.reshape(-1)).reshape(logits.shape)
+    if rounding == "stochastic":
+        left = (budget - least) * shares
+        scale = _scale(lax.stop_gradient(left), logits.size * (budget - least), 0, most - least)
+        return least + jnp.clip(left * scale, 0, most - least)
+    shares = budget * shares
     if rounding == "nearest":
         wanted = jnp.clip(shares, least, most)
         return wanted + lax.stop_gradient(jnp.round(wanted) - wanted)
-    total = round(pixels * budget)
+    total = round(logits.size * budget)
     wanted = jnp.clip(shares * _scale(lax.stop_gradient(shares), total, least, most), least, most)
-    if rounding == "stochastic":
-        return wanted
     return wanted + lax.stop_gradient(_whole(wanted, total, most) - wanted)
 
 
@@ -250,7 +256,7 @@ _REACH = 60.0
 _HALVINGS = 36
 
 
-def _scale(shares: jax.Array, total: int, least: int, most: int) -> jax.Array:
+def _scale(shares: jax.Array, total: float, least: float, most: float) -> jax.Array:
     """The factor for which ``clip(factor * shares, least, most)`` has the sum ``total``; its logarithm is bisected."""
 
     def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

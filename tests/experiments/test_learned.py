@@ -87,12 +87,11 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     # Of each clip, as many frames as give a network a history after its two, and what these methods read.
     monkeypatch.setattr(stages, "render", lambda source, *how, **more: render(source._replace(frames=3), *how, **more))
     monkeypatch.setattr(small_lights, "FRAMES", 3)
-    monkeypatch.setattr(small_lights, "READERS", "svgf")
     for module in (stages, curves, small_lights):
         monkeypatch.setattr(module, "LAYERS", (1, 2, 4, 8))
-    for module in (stages, curves):
         monkeypatch.setattr(module, "COMPARED", "svgf")
-    monkeypatch.setattr(stages, "TRAINED", "svgf")
+    for module in (stages, small_lights):
+        monkeypatch.setattr(module, "TRAINED", "svgf")
     seen = ntasd_holdout.SEEN
     rows = (seen, f"{seen}, only parlour", f"{seen}, without parlour")
     lit = stages.stage_of_budget(ntasd_budgets.CHOSEN, 4)
@@ -295,8 +294,9 @@ def test_budgets_compare_what_differs_in_the_place_of_samples_alone() -> None:
         )
         assert chosen.clips == uniform.clips == ntasd_budgets.TABLE.clips == "small lights"
         assert chosen.options["pattern"] == "rotating"
-        assert uniform.options | {"pattern": "rotating"} == chosen.options | {"adaptive": False}
-        assert (chosen.options["budget"], chosen.options["least"], chosen.recipe) == (budget, 0, uniform.recipe)
+        placed = {"pattern": "rotating", "least": budget / 2}
+        assert uniform.options | placed == chosen.options | {"adaptive": False}
+        assert (chosen.options["budget"], uniform.options["least"], chosen.recipe) == (budget, 0, uniform.recipe)
         if budget in stages.ROTATING:
             rotating = stages.STAGES[stages.stage_of_budget(ntasd_budgets.PATTERN, budget)]
             assert rotating.options == uniform.options | {"pattern": "rotating"}

@@ -358,6 +358,26 @@ def test_numbers_are_the_largest_remainders(rng):
     np.testing.assert_array_equal(paper, np.round(shares))
 
 
+def test_every_pixel_has_a_fraction_before_the_rest_is_placed(rng):
+    with jax.enable_x64(True):
+        logits = jnp.asarray(3 * rng.normal(size=(6, 7, 1)))
+        counts = sample_map(logits, 0.5, least=0.2, most=63, rounding="stochastic")
+        shares = np.exp(logits) / np.exp(logits).sum()
+        np.testing.assert_allclose(counts, 0.2 + 42 * 0.3 * shares, rtol=1e-6)
+        # Those that have hardly more than the fraction can still get more.
+        slope = jax.jit(jax.grad(lambda x: sample_map(x, 0.5, least=0.2, most=63, rounding="stochastic").ravel()[0]))
+        first = shares.ravel()[0]
+        np.testing.assert_allclose(slope(logits).ravel()[0], 42 * 0.3 * first * (1 - first), rtol=1e-6)
+    even = sample_map(jnp.asarray(rng.normal(size=(4, 5, 1))), 0.2, least=0.2, most=63, rounding="stochastic")
+    np.testing.assert_allclose(even, 0.2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rounding", ["exact", "nearest"])
+def test_a_fraction_for_every_pixel_needs_fractions(rounding):
+    with pytest.raises(ValueError, match=r"least: expected a whole number .* rounding 'stochastic', got 0\.2"):
+        sample_map(jnp.zeros((4, 4, 1)), 1, least=0.2, most=7, rounding=rounding)
+
+
 def test_one_huge_logit_takes_what_a_pixel_can_have_and_a_nan_counts_as_zero():
     logits = jnp.zeros((4, 5, 1)).at[1, 2].set(1e6)
     counts = sample_map(logits, 4, most=63)

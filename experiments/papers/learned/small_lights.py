@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.papers.learned.stages import LAYERS, REFERENCE_SPP, TEST_SEED, Settings, place_of
+from experiments.papers.learned.stages import COMPARED, LAYERS, REFERENCE_SPP, TEST_SEED, TRAINED, Settings, place_of
 from jaxdn.render.clip import render_clip
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
@@ -26,8 +26,6 @@ from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import find_denoiser, plan_clip
 
 FRAMES = 8
-READERS = "ntasd,svgf,steady"
-"""The methods whose buffers the clips have."""
 _HALF = (3.6, 2.6, 2.4)
 
 
@@ -103,13 +101,14 @@ def render_small_lights(settings: Settings) -> list[Path]:
         settings.size, settings.size, layers=LAYERS, reference_spp=REFERENCE_SPP, light="reflected", max_depth=4
     )
     for seed in range(4 * settings.clips):
-        _render(seed, place / "train", own)
-    return [_render(TEST_SEED + index, place / "test", replace(own, reference_spp=256)) for index in range(4)]
+        _render(seed, place / "train", own, TRAINED)
+    tested = replace(own, reference_spp=256)
+    return [_render(TEST_SEED + index, place / "test", tested, COMPARED) for index in range(4)]
 
 
-def _render(seed: int, place: Path, settings: RenderSettings) -> Path:
-    """The folder of the clip of a seed, rendered if it is not there."""
+def _render(seed: int, place: Path, settings: RenderSettings, readers: str) -> Path:
+    """The folder of the clip of a seed with the buffers that these methods read, rendered if it is not there."""
     stage = small_lights(seed)
-    planned = plan_clip(stage, settings, frames=FRAMES, denoiser=find_denoiser(READERS))
+    planned = plan_clip(stage, settings, frames=FRAMES, denoiser=find_denoiser(readers))
     assert planned is not None
     return render_clip(stage, place / f"{stage.name}-{seed}", replace(settings, plan=planned.plan), frames=FRAMES)
