@@ -49,11 +49,12 @@ class Options(Sampling):
     (training). None is XLA."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.least < 1:
-            raise ValueError(f"least: expected at least 1, the sample that is rendered first, got {self.least}.")
-        if self.least % 2 == 0:
+            raise ValueError(f"least: expected at least 1, the sample that is rendered first, got {self.least:g}.")
+        if self.least % 2 != 1:
             raise ValueError(
-                f"least: expected an odd number, the sample that is rendered first and pairs, got {self.least}."
+                f"least: expected an odd number, the sample that is rendered first and pairs, got {self.least:g}."
             )
         if self.rounding == "stochastic":
             raise ValueError(

@@ -18,7 +18,7 @@ from jax import lax
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, MULTIPLE, Widths
-from jaxdn.ops.sampling import check_budget, sample_map
+from jaxdn.ops.sampling import check_budget, check_least, sample_map
 from jaxdn.ops.scales import crop, pad
 
 SMALL: Widths = ((8,), (16, 16), (24, 24), (32, 32), (32, 32))
@@ -44,6 +44,9 @@ class Sampling:
     slope: Literal["mixing", "amplitude"] = "mixing"
     """What one more sample does to the image in training, see :func:`jaxdn.ops.sampling.more_samples`: a sample without
     noise is mixed in, or the noise falls as the root of the number. Fractions have the slope of their two numbers."""
+
+    def __post_init__(self) -> None:
+        check_least(self.least, self.rounding)
 
 
 class Sampler(NamedTuple):

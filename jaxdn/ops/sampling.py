@@ -210,6 +210,12 @@ def check_budget(budget: float, *, least: float, most: int) -> None:
         )
 
 
+def check_least(least: float, rounding: str) -> None:
+    """Raise ValueError for a fraction of a sample where numbers of samples are whole."""
+    if rounding != "stochastic" and least != int(least):
+        raise ValueError(f"least: expected a whole number of samples, but with rounding 'stochastic', got {least:g}.")
+
+
 def sample_map(logits: jax.Array, budget: float, *, least: float = 0, most: int, rounding: str = "exact") -> jax.Array:
     """Numbers of samples [H, W, 1] from ``least`` to ``most``, ``budget`` in the mean: a softmax over the image.
 
@@ -232,8 +238,7 @@ def sample_map(logits: jax.Array, budget: float, *, least: float = 0, most: int,
     check_image(logits, "logits", channels=1)
     check_option(rounding, "rounding", ("exact", "nearest", "stochastic"))
     check_budget(budget, least=least, most=most)
-    if rounding != "stochastic" and least != int(least):
-        raise ValueError(f"least: expected a whole number of samples, but with rounding 'stochastic', got {least:g}.")
+    check_least(least, rounding)
     logits = jnp.asarray(logits)
     logits = jnp.where(jnp.isfinite(logits), logits, 0.0).astype(jnp.promote_types(logits.dtype, jnp.float32))
     logits = jnp.maximum(logits, lax.stop_gradient(jnp.max(logits)) - _REACH)

@@ -352,6 +352,8 @@ def test_options_that_make_no_sense_raise():
     with pytest.raises(ValueError, match=r"rounding: expected 'exact' or 'nearest', .* got 'stochastic'"):
         dasr(rounding="stochastic")
     for name in METHODS:
+        with pytest.raises(ValueError, match=r"least: expected a whole number of samples, .* got 1\.5"):
+            METHODS[name](least=1.5)
         with pytest.raises(ValueError, match=r"budget: expected a number > 0, got 0"):
             METHODS[name](budget=0)
         assert methods()[name].parse_options({"preset": "paper"}).rounding == "nearest"
