@@ -124,6 +124,7 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     assert trained_on == [f"small-lights-{seed}" for seed in range(4)]
     record = json.loads((tmp_path / "data" / "small-lights" / "test" / "small-lights-2000" / "clip.json").read_text())
     assert record["light"] == "reflected"
+    assert "visible" in record["plan"]["frames"][1], "errors of disoccluded pixels are not reported"
     drawn = json.loads((tmp_path / "runs" / "curves.json").read_text())
     assert [len(drawn["ntasd"][name]) for name in ("ssim", "mse")] == [4, 4]
     assert min(drawn["ntasd"]["mse"]) > 0

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.papers.learned.stages import COMPARED, LAYERS, REFERENCE_SPP, TEST_SEED, TRAINED, Settings, place_of
+from jaxdn.planning.plan import SCORED
 from jaxdn.render.clip import render_clip
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
@@ -107,8 +108,11 @@ def render_small_lights(settings: Settings) -> list[Path]:
 
 
 def _render(seed: int, place: Path, settings: RenderSettings, readers: str) -> Path:
-    """The folder of the clip of a seed with the buffers that these methods read, rendered if it is not there."""
+    """The folder of the clip of a seed with what these methods read and errors are reported by, rendered if it is not there."""
     stage = small_lights(seed)
-    planned = plan_clip(stage, settings, frames=FRAMES, denoiser=find_denoiser(readers))
+    reader = find_denoiser(readers)
+    assert reader is not None
+    reader = reader._replace(reads=reader.reads | SCORED)
+    planned = plan_clip(stage, settings, frames=FRAMES, denoiser=reader)
     assert planned is not None
     return render_clip(stage, place / f"{stage.name}-{seed}", replace(settings, plan=planned.plan), frames=FRAMES)
