@@ -108,7 +108,10 @@ def render_small_lights(settings: Settings) -> list[Path]:
 
 
 def _render(seed: int, place: Path, settings: RenderSettings, readers: str) -> Path:
-    """The folder of the clip of a seed with what these methods read and errors are reported by, rendered if it is not there."""
+    """The folder of the clip of a seed, rendered if it is not there.
+
+    It has what these methods read, and what errors are reported by.
+    """
     stage = small_lights(seed)
     reader = find_denoiser(readers)
     assert reader is not None
