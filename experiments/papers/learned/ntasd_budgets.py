@@ -2,10 +2,10 @@
 
 Hasselgren et al. 2020 report 0.66 to 0.75 of the relative MSE of uniform sampling, at four samples. Here networks are
 trained and tested in rooms with a small lamp (:mod:`experiments.papers.learned.small_lights`). A network places half of
-the budget; the numbers are rounded by a fixed pattern that rotates from frame to frame. It is compared with the same number of samples
-everywhere, whose fractions are rounded at random or, for budgets below one, by that pattern. Each network is trained
-with its own budget, from that of the next larger one: at equal budgets all have had as many updates, at smaller budgets
-more.
+the budget; the numbers are rounded by a fixed pattern that rotates from frame to frame. It is compared with the same
+number of samples everywhere, whose fractions are rounded at random or, for budgets below one, by that pattern. Each
+network is trained with its own budget, from that of the next larger one: at equal budgets all have had as many updates,
+at smaller budgets more.
 """
 
 from typing import Any
