@@ -47,6 +47,7 @@ class Options(Sampling):
     """What stages give their networks."""
 
     size: str = "small"
+    pattern: str = "random"
 
 
 def weighted(options: Options) -> Denoiser:
