@@ -1,4 +1,4 @@
-"""Rooms in which it matters where samples go: a small lamp, deep shadows, and posts that march through both.
+"""Rooms for networks that place samples to learn in: a small lamp, deep shadows, posts that march through both.
 
 All reflected light is rendered. Where a small lamp shines, one sample is enough for most of it; in its shadow light
 comes from walls alone, and one sample says little. What the posts uncover has no history. Metres, y up.
