@@ -40,7 +40,8 @@ def record_table(one: Table, found: Results, settings: Settings) -> dict[str, An
     if any(STAGES[row].start for row in one.rows if row in STAGES):
         what += " Networks of smaller budgets go on from those of the next larger one and so have had more updates."
     if one.clips == "small lights":
-        what += " What the networks that choose are given to place, half of the budget, was settled on these test clips."
+        what += " What the networks that choose are given to place, half of the budget,"
+        what += " was settled on these test clips."
     title = one.heading + (", as published" if settings.as_published else "")
     described = describe_measurement(
         "table", title, "Quality", _ORDER, command=_command(settings), what=what, rows=rows
